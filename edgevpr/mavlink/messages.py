@@ -21,9 +21,9 @@ SENSOR_ID = 1  # `id` in message 296; must equal EKF2_AGP0_ID, whose value 0 wou
 _YAW_SD_RAD = math.radians(5.0)
 # A reserve must never outrank a real receiver with a 3D fix, which needs four satellites. At equal fix type ArduPilot
 # switches to the receiver with more satellites, and blends by accuracy (AP_GPS::update_primary, AP_GPS_Blended).
-_RESERVE_SATELLITES = 2
-_RESERVE_SD_M = 100.0
-_RESERVE_SD_M_S = 10.0
+_FALLBACK_SATELLITES = 2
+_FALLBACK_SD_M = 100.0
+_FALLBACK_SD_M_S = 10.0
 _NORMAL_SATELLITES = 6  # the minimum for a filter to start
 _GPS_EPOCH_S = 315_964_800  # 1980-01-06
 _LEAP_S = 18  # leap seconds since the GPS epoch, as of 2017
@@ -70,7 +70,7 @@ class Fix:
 class MotionState:
     """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
     standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
-    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_reserve`: a fallback, as real GPS has a fix."""
+    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_fallback`: a fallback, as real GPS has a fix."""
 
     t_mono_s: float
     lat_deg: float
@@ -81,7 +81,7 @@ class MotionState:
     alt_accuracy_m: float
     speed_accuracy_m_s: float
     attitude: tuple[float, float, float] | None = None
-    is_reserve: bool = False
+    is_fallback: bool = False
 
 
 def make_heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> Message:
@@ -132,15 +132,15 @@ def make_position_sensor(state: MotionState) -> Message:
 
 def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) for GPS receiver `receiver` (0: the first). A `state` of None is sent as "no fix", a
-    fallback (`is_reserve`) as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970
+    fallback (`is_fallback`) as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970
     (None: unknown)."""
     week, time_of_week_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
     satellites, sd_m, sd_m_s = 0, 0.0, 0.0
     if state:
         satellites, sd_m, sd_m_s = _NORMAL_SATELLITES, state.accuracy_m, state.speed_accuracy_m_s
-    if state and state.is_reserve:
-        satellites, sd_m, sd_m_s = _RESERVE_SATELLITES, _RESERVE_SD_M, _RESERVE_SD_M_S
+    if state and state.is_fallback:
+        satellites, sd_m, sd_m_s = _FALLBACK_SATELLITES, _FALLBACK_SD_M, _FALLBACK_SD_M_S
     return mavlink.MAVLink_gps_input_message(
         time_usec=round(stamp_s * 1e6),
         gps_id=receiver,

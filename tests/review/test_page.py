@@ -102,7 +102,7 @@ def test_report_makes_a_page_without_the_map(flown, tmp_path):
     [
         (["LOG", "--out", "LOG"], 2, "pass another output file"),
         (["LOG", "--out", "no/such/out.html"], 2, "its folder does not exist: create it first"),
-        (["gone", "--out", "out.html"], 2, "there is no such flight log"),
+        (["gone", "--out", "out.html"], 2, "There is no flight log"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
         (["LOG", "--out", "out.html", "--images", "gone"], 2, "does not exist: pass a folder"),
         (["empty", "--out", "out.html"], 1, "contains no flight-log lines"),

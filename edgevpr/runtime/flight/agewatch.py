@@ -1,11 +1,11 @@
 """Estimates the hidden delay of frames: how much older they are than their timestamps, because of an encoder or a
-buffer before the timestamp. Only the aircraft's own motion shows it.
+buffer before the timestamp. Only the aircraft's own motion reveals it.
 
 Accepted matches are compared with the motion that the autopilot reports. In turns and at changes of speed, a delay
-shifts and rotates each match as no wind and no compass error does. A known delay is subtracted from the time of each
-frame. If the delay changes suddenly, the age of frames is unknown, and none is used until the delay is as before or
-the new one is known. In straight flight at constant speed, matches do not show a constant delay: then the claimed
-error includes the delay that is usual for the kind of camera (`Frame.delay_sd_s`).
+shifts and rotates each match as neither wind nor a compass error does. A known delay is subtracted from the time of
+each frame. If the delay changes suddenly, the age of frames is unknown, and none is used until the old delay returns or
+the new one is known. In straight flight at constant speed, matches do not show a constant delay: then the claimed error
+includes the delay that is usual for the kind of camera (`Frame.delay_sd_s`).
 """
 
 import math
@@ -24,15 +24,15 @@ DELAYS_S = np.arange(-1.0, 6.05, 0.1)  # candidates
 
 _HISTORY_S = 60.0  # of the motion and of the matches that are compared with it
 _MAX_MOTION_GAP_S = 1.0  # between two reports
-_MIN_INTERVAL_S = 0.9  # between two matches: earlier ones carry no new information
+_MIN_INTERVAL_S = 0.9  # between two matches: an earlier one adds no information
 _MAX_MATCHES = 20
 _MIN_MATCHES = 4  # to estimate a delay
-# Most chi-square of a delay by the prior, the usual delay of such a camera, since a delay of seconds is possible.
-# Negative delays are so many times less usual, and have no such limit.
+# Largest chi-square of a delay under the prior, the usual delay of such a camera, since a delay of seconds is possible.
+# For a negative delay the deviation is multiplied by this factor, without a limit, because such delays are rare.
 _MAX_PRIOR_CHI2 = 30.0
 _NEGATIVE_FACTOR = 4.0
-# Differences between reported motion and matches, beyond the accuracy of the matches: of velocity, by an unknown wind
-# (m/s) and its random walk (m/s in one second), or with GPS; of heading, by compass and mount, and its random walk.
+# Differences between reported motion and matches, beyond the accuracy of the matches: of velocity, due to unknown wind
+# (m/s) and its random walk (m/s in one second), or with GPS; of heading, due to compass and mount, and its random walk.
 _START_SD_M = 1e3
 _WIND_SD_M_S = 8.0
 _WIND_RANDOM_WALK_M_S = 0.5
@@ -44,8 +44,8 @@ _DIRECTION_SD_DEG = 2.0
 _HEADING_OFFSET_GAIN = 0.25
 _UNKNOWN_HEADING_OFFSET = 0.0, 30.0
 # A match contradicts the current delay if another one fits far better, and agrees with it if no other fits: chi-square
-# with three degrees of freedom. When a stream is reopened, its delay may change by so much; one that differs by 1.5 s
-# is another one.
+# with three degrees of freedom. When a stream is reopened, its delay may change by 0.5 s; one that differs by 1.5 s
+# is a different delay.
 _CONTRADICTION_CHI2 = 14.0
 _MIN_GAIN_CHI2 = 10.0
 _AGREEMENT_CHI2 = 9.0
@@ -54,11 +54,11 @@ _MAX_DELAY_CHANGE_S = 0.5
 _MIN_OTHER_DELAY_S = 1.5
 _MAX_COMPARED = 12  # matches
 _MAX_DELAY_SD_S = 0.3  # of a known delay
-_MAX_CHI2_PER_MATCH = 3.0  # if all have one delay
+_MAX_CHI2_PER_MATCH = 3.0  # if all have the same delay
 _MIN_PENDING_MATCHES = 8  # to accept another delay
-_PAST_CHI2_SHARE = 0.9  # weight of the matches before the last half minute
-_MIN_AGREEING = 2  # matches in a row after which the delay is as before
-_MAX_OUTLIERS = 3  # contradictions in a row that no delay explains: then the reported motion is wrong
+_PAST_CHI2_WEIGHT = 0.9  # of the matches before the last half minute
+_MIN_AGREEING = 2  # consecutive matches after which the old delay counts as confirmed
+_MAX_OUTLIERS = 3  # consecutive contradictions that no delay explains: then the reported motion is wrong
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,14 +97,14 @@ class AgeWatch:
 
     def __init__(self) -> None:
         self.is_unknown = False
-        # Reports: time, position, heading and velocity; growth of the velocity's variance, and its variance at a start.
+        # Reports: time, position, heading and velocity; growth of the velocity's variance, and its initial variance.
         self._motion: deque[tuple[float, ...]] = deque()
         self._origin: Position | None = None
         self._matches: list[TimedMatch] = []
         self._pending: list[TimedMatch] = []  # since the age became unknown
         self._delay: Delay | None = None
-        self._past_chi2, self._past_until_s = np.zeros(len(DELAYS_S)), -math.inf  # by matches until then
-        self._heading_offset_deg, self._heading_offset_s = math.nan, 0.0  # of matches from reports, until then
+        self._past_chi2, self._past_until_s = np.zeros(len(DELAYS_S)), -math.inf  # from matches until then
+        self._heading_offset_deg, self._heading_offset_s = math.nan, 0.0  # matches minus reports; last update
         self._prior_sd_s, self._applied_delay_s = FRAME_TIME_SD_S, 0.0
         self._agreeing = self._outliers = 0
 
@@ -115,7 +115,7 @@ class AgeWatch:
 
     def add_motion(self, t_s: float, velocity_m_s: Doubles, heading_deg: float | None, has_gps: bool) -> None:
         """Add the reported motion at `t_s`: velocity (2,), east and north, and heading of the aircraft. `has_gps`: the
-        velocity is as accurate as by GPS."""
+        velocity has the accuracy of GPS."""
         if self._motion and t_s <= self._motion[-1][0]:
             return
         if self._motion and t_s - self._motion[-1][0] > _MAX_MOTION_GAP_S:
@@ -141,13 +141,13 @@ class AgeWatch:
     def correct(self, frame: Frame) -> Frame:
         """Return a frame with its time corrected by the delay, and the error of the delay in `t_sd_s`."""
         self._prior_sd_s, self._applied_delay_s = frame.delay_sd_s, self.delay_s
-        known = self._delay or Delay(0.0, frame.delay_sd_s)
-        sd_s = math.hypot(known.sd_s, known.s - self._applied_delay_s)
+        delay = self._delay or Delay(0.0, frame.delay_sd_s)
+        sd_s = math.hypot(delay.sd_s, delay.s - self._applied_delay_s)
         return replace(frame, t_mono_s=frame.t_mono_s - self._applied_delay_s, t_sd_s=math.hypot(frame.t_sd_s, sd_s))
 
     def judge(self, event: Recognition) -> None:
-        """Process the accepted match of the frame that `correct` returned last. If `is_unknown` is True then, the match
-        must not be used."""
+        """Process the accepted match of the frame that `correct` returned last. If `is_unknown` is True afterwards, the
+        match must not be used."""
         self._drop_old_matches()
         match = self._make_match(event)
         if match is None:
@@ -169,7 +169,7 @@ class AgeWatch:
             self._update_heading_offset(match)
 
     def _update_delay(self, now_s: float) -> None:
-        """Estimate the delay again with one match more."""
+        """Estimate the delay again after a new match."""
         new = [match for match in self._matches if match.t_s > self._past_until_s and match.delay_s is None]
         if len(new) < _MIN_MATCHES:
             return
@@ -180,10 +180,10 @@ class AgeWatch:
         prior = np.where(sigmas < 0, (_NEGATIVE_FACTOR * sigmas) ** 2, np.minimum(sigmas**2, _MAX_PRIOR_CHI2))
         self._delay = _estimate_delay(chi2 + prior)
         if now_s - new[0].t_s > _HISTORY_S / 2 or len(new) == _MAX_MATCHES:
-            self._past_until_s, self._past_chi2 = now_s, _PAST_CHI2_SHARE * (chi2 - chi2.min())
+            self._past_until_s, self._past_chi2 = now_s, _PAST_CHI2_WEIGHT * (chi2 - chi2.min())
 
     def _update_heading_offset(self, match: TimedMatch) -> None:
-        """Update the difference between the headings by matches and by the compass, while the delay is as usual."""
+        """Update the mean heading of matches minus that of the compass, while the delay is the usual one."""
         times_s, _, _, headings_deg, *_ = np.array(self._motion).T
         exposure_s = match.t_s - (self._delay.s if self._delay else 0.0)
         offset_deg = float(wrap_deg(match.heading_deg - np.interp(exposure_s, times_s, headings_deg)))
@@ -193,7 +193,7 @@ class AgeWatch:
             self._heading_offset_s = match.t_s
 
     def _resume(self) -> None:
-        """Use frames again if their delay is as before, or the new one is known."""
+        """Use frames again if the old delay is confirmed, or the new one is known."""
         if self._agreeing >= _MIN_AGREEING:
             self._pending, self.is_unknown = [], False
         if len(self._pending) < _MIN_PENDING_MATCHES:
@@ -206,7 +206,7 @@ class AgeWatch:
             self._past_until_s, self._past_chi2 = -math.inf, np.zeros(len(DELAYS_S))
 
     def _drop_old_matches(self) -> None:
-        """Drop matches from before the recorded motion."""
+        """Drop matches older than the stored motion."""
         from_s = self._motion[0][0] + DELAYS_S[-1] if self._motion else math.inf
         self._matches = [match for match in self._matches if match.t_s >= from_s]
         self._pending = [match for match in self._pending if match.t_s >= from_s][-_MAX_MATCHES:]
@@ -230,7 +230,7 @@ class AgeWatch:
         return TimedMatch(t_s=t_s, east_m=float(east_m), north_m=float(north_m), heading_deg=heading_deg, sd_m=sd_m)
 
     def _compare(self, match: TimedMatch) -> tuple[Comparison, Delay | None]:
-        """Compare a match with the delay of those before it; return also its own delay (None: none fits)."""
+        """Compare a match with the delay of the earlier ones; also return its own delay (None: none fits)."""
         earlier = self._matches[-_MAX_COMPARED:]
         if self._delay is None or len(earlier) < _MIN_MATCHES:
             return Comparison.UNKNOWN, None
@@ -253,7 +253,7 @@ class AgeWatch:
         self, matches: list[TimedMatch], delays_s: Doubles, offset: tuple[float, float] = _UNKNOWN_HEADING_OFFSET
     ) -> Doubles:
         """Return the chi-square (k,) of matches against the reported motion, with k sets of delays (k, n). `offset`:
-        mean difference of the headings of matches from those reported, and its standard deviation, degrees."""
+        mean heading of the matches minus that reported, and its standard deviation, degrees."""
         motion_s, east_m, north_m, headings_deg, _, _, growth_m2_s2, start_m2_s2 = np.array(self._motion).T
         rows = [(match.t_s, match.east_m, match.north_m, match.heading_deg, match.sd_m) for match in matches]
         t_s, *matched_m, matched_deg, sd_m = np.array(rows).T
@@ -286,7 +286,7 @@ def _estimate_delay(chi2: Doubles) -> Delay:
 
 def _integrate_drift(motion_s: Doubles, growth_m2_s2: Doubles, elapsed_s: Doubles, earlier_s: Doubles) -> Doubles:
     """Return the covariance (k, n, n), m2, of a velocity error integrated from 0 to the times `elapsed_s` (k, n). Its
-    variance grows by `growth_m2_s2` (m,) at the times `motion_s` (m,). `earlier_s` (k, n, n): the earlier one of each
+    variance grows by `growth_m2_s2` (m,) at the times `motion_s` (m,). `earlier_s` (k, n, n): the earlier of each
     pair of times."""
     growth_m2_s2 = np.where(motion_s > 0, growth_m2_s2, 0.0)
     sums = np.cumsum(growth_m2_s2), np.cumsum(growth_m2_s2 * motion_s), np.cumsum(growth_m2_s2 * motion_s**2)

@@ -1,4 +1,4 @@
-"""Communication of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and returns
+"""Communication of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and reports
 the state of the link. An event is the `Recognition` of one frame. The loop of `flight` uses it."""
 
 import logging
@@ -20,8 +20,8 @@ from edgevpr.runtime.flight.notifier import Alert, Notifier
 from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# To an autopilot that is alive, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
-# long, so that the log line of the query can say whether the fix was sent.
+# A fix is sent to a live autopilot within a fraction of a millisecond. The loop waits for that, at most this
+# long, so that the log line of the query can contain whether the fix was sent.
 _MAX_SEND_WAIT_S = 0.02
 
 DRY_RUN = Reason(ReasonCode.DRY_RUN)
@@ -30,15 +30,15 @@ _UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
 _MIN_REPORTED_DELAY_S = 0.3
 
 _SOURCE_SET_RETRY_S = 2.0  # between two requests for a source set, until one is answered
-_MIN_GPS_GOOD_S = 10.0  # how long GPS must be good before the source set with GPS is requested again
+_MIN_GPS_GOOD_S = 10.0  # GPS must be good for this long before the source set with GPS is requested again
 
 _log = logging.getLogger(__name__)
 
 
 class AutopilotOutput:
     """Sends fixes and other messages over an open link: a match as a fix if the `navigator` advises so; a dry run
-    omits only the sending. `cores` is the number of the board's cores. State shared with the link's thread is accessed
-    in turns only (`Link.turn`)."""
+    only omits the sending. `cores` is the number of the board's cores. State shared with the link's thread is accessed
+    only in turns (`Link.turn`)."""
 
     def __init__(
         self, link: Link, navigator: Navigator, notifier: Notifier, *, settings: MavlinkConfig, cores: int, clock: Clock
@@ -55,13 +55,13 @@ class AutopilotOutput:
     def summary(self) -> str:
         """Counts of fixes and of refused messages from other systems so far, in a few words."""
         stats = self._link.stats()
-        taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} accepted"
+        sent = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} accepted"
         if stats.positions_sent:
             use = "does not report whether it uses them"
             if stats.used_share is not None:
                 use = f"used them in {stats.used_share:.0%} of its reports"
-            taken = f"{stats.positions_sent} positions sent, the autopilot {use}"
-        sent = taken if self._send_fixes else str(DRY_RUN)
+            sent = f"{stats.positions_sent} positions sent, the autopilot {use}"
+        summary = sent if self._send_fixes else str(DRY_RUN)
         counts = (
             (sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0), f"refused ({stats.refused_why})"),
             (stats.unanswered_fixes, "unanswered"),
@@ -70,7 +70,7 @@ class AutopilotOutput:
             (stats.withheld_fixes, "withheld: no answers"),
             (stats.foreign_messages, "foreign messages refused"),
         )
-        return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
+        return ", ".join([summary, *(f"{count} {label}" for count, label in counts if count)])
 
     def state(self) -> dict[str, Any]:
         """Return the state of the link for the status: `trouble`, why the port could not be opened or was lost (None:
@@ -87,46 +87,47 @@ class AutopilotOutput:
             }
 
     def log_answers(self) -> None:
-        """Write a log line "answer" for each fix that was answered, timed out, or was given up before it was sent,
+        """Write a log line "answer" for each fix that was answered, timed out, or was dropped before it was sent,
         since the last call; and a line "between" for each fix that was sent between two matches."""
         with self._link.turn("answers"):
-            for sending in self._link.take_interim_fixes():
-                self._notifier.log("between", t_sent_s=sending.t_sent_s, **_position_fields(sending.fix))
+            for transmission in self._link.take_interim_fixes():
+                self._notifier.log("between", t_sent_s=transmission.t_sent_s, **_position_fields(transmission.fix))
             # An answer can arrive a moment before the link has recorded that the fix was sent.
             settled = [item for item in self._unanswered if item[1].sent is False or (item[1].sent and item[1].outcome)]
-            for query, sending in settled:
-                self._unanswered.remove((query, sending))
-                outcome = sending.outcome
+            for query, transmission in settled:
+                self._unanswered.remove((query, transmission))
+                outcome = transmission.outcome
                 latency_s = outcome.latency_s if outcome else None
                 self._notifier.log(
                     "answer",
                     query=query,
-                    sent=sending.sent,
-                    result=sending.answer,
-                    why=outcome.why if outcome else sending.why,
+                    sent=transmission.sent,
+                    result=transmission.answer,
+                    why=outcome.why if outcome else transmission.why,
                     latency_ms=None if latency_s is None else round(latency_s * 1e3, 1),
-                    t_sent_s=sending.t_sent_s,
+                    t_sent_s=transmission.t_sent_s,
                 )
 
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
-        """Send the fix of an event, if there is one to send, and its figures. Return the event with the report of its
+        """Send the fix of an event, if any, and its figures. Return the event with the report of its
         fix, and its accuracy in flight. `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("use"):
-            fix, sending = None, None
+            fix, transmission = None, None
             if event.accepted:
                 event = self._navigator.report_accuracy(event)
-                fix, sending = self._send_match(event)
+                fix, transmission = self._send_match(event)
             else:
                 self._navigator.handle_frame(event)
             is_alive = self._link.is_alive()
-        if sending and is_alive:
-            sending.wait(_MAX_SEND_WAIT_S)
+        if transmission and is_alive:
+            transmission.wait(_MAX_SEND_WAIT_S)
         with self._link.turn("use of its fix"):
-            if sending:
-                if sending.sent is not False:  # an unsent fix gets no answer; the line of its query has the reason
-                    self._unanswered.append((event.name, sending))
-                fields = _position_fields(sending.fix)
-                fix = FixReport(query=event.name, sent=sending.sent, why=sending.why, answer=sending.answer, **fields)
+            if transmission:
+                sent, why, answer = transmission.sent, transmission.why, transmission.answer
+                if sent is not False:  # an unsent fix gets no answer; the log line of its query has the reason
+                    self._unanswered.append((event.name, transmission))
+                fields = _position_fields(transmission.fix)
+                fix = FixReport(query=event.name, sent=sent, why=why, answer=answer, **fields)
             self._send_figures(event, used_mah)
         return replace(event, fix=fix)
 
@@ -136,8 +137,8 @@ class AutopilotOutput:
             return self._navigator.age.correct(frame)
 
     def check_age(self, event: Recognition) -> Recognition:
-        """Return the event of a match, without the match if the age of its picture is unknown. Report when that begins
-        and ends, and the corrected delay."""
+        """Return the event of a match, without the match if the age of its picture is unknown. Report when this begins
+        and ends, and the delay that is corrected."""
         with self._link.turn("age"):
             age = self._navigator.age
             age.judge(event)
@@ -167,7 +168,7 @@ class AutopilotOutput:
             self._navigator.handle_frame(event, is_query=False)
 
     def needs_motion_frames(self) -> bool:
-        """Return True if the position depends on matches, so that odometry between them is useful."""
+        """Return True if odometry between matches is useful, because the position depends on matches."""
         with self._link.turn("wants strides"):
             return not self._navigator.has_gps
 
@@ -181,22 +182,22 @@ class AutopilotOutput:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.make_named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
-    def compare_gps(self, off_m: float, is_wrong: bool, have_agreed: bool) -> None:
-        """Send the distance `off_m` (metres) from GPS to a match. While GPS `is_wrong`, because it contradicts the map,
-        the navigator does not use it. Unless they `have_agreed` before, the map is as likely to be wrong: then GPS is
-        used, and no position is sent."""
+    def compare_gps(self, distance_m: float, is_wrong: bool, have_agreed: bool) -> None:
+        """Send the distance from GPS to a match. While GPS `is_wrong`, because it contradicts the map,
+        the navigator does not use it. Unless they `have_agreed` before, the map is equally likely to be wrong: then GPS
+        is used, and no position is sent."""
         with self._link.turn("gps"):
-            self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
+            self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(distance_m)))
             self._navigator.trust_gps(not is_wrong or not have_agreed)
             self._navigator.distrust_map(is_wrong and not have_agreed)
 
     def correct_height(self, ratio: float, ratio_sd: float) -> None:
-        """Set the ratio of visual height to the autopilot's height above ground (1.0: they agree), and its error."""
+        """Set the ratio of visual height to the autopilot's height above ground (1.0: equal), and its error."""
         with self._link.turn("height"):
             self._navigator.correct_height(ratio, ratio_sd)
 
     def reset_navigation(self) -> None:
-        """Restart the navigation, since later fixes have different errors."""
+        """Restart the navigation, because later fixes have different errors."""
         with self._link.turn("anew"):
             self._navigator.reset_navigation()
 
@@ -226,7 +227,7 @@ class AutopilotOutput:
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:
-        """Report what a continuous channel sends if it has changed."""
+        """Report a change in what a continuous channel sends."""
         output = self._navigator.output
         if self._link.channel.is_continuous and output is not self._output:
             self._output = output
@@ -234,7 +235,7 @@ class AutopilotOutput:
             self._notifier.announce(output.severity, output.text, topic="output")
 
     def _send_match(self, event: Recognition) -> tuple[FixReport | None, FixTransmission | None]:
-        """Send the fix of an accepted match. Return (None, transmission), or (report why it is not sent, None)."""
+        """Send the fix of an accepted match. Return (None, transmission) or, if it is not sent, (its report, None)."""
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
@@ -275,8 +276,8 @@ class SourceSets:
         return self._with_gps is not None and self._without is not None
 
     def choose_set(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
-        """Return the number of the set to request now (None: none). `has_gps`: there is a trusted GPS; `has_own`: our
-        own position is known well enough; `answered_s`: when such a request was last answered."""
+        """Return the number of the set to request now (None: no request). `has_gps`: there is a trusted GPS; `has_own`:
+        our own position is known well enough; `answered_s`: when such a request was last answered."""
         if not has_gps:
             self._bad_s = now_s
         number = self._without if not has_gps and has_own else None
@@ -300,7 +301,7 @@ def report_unsent(event: Recognition, why: Reason) -> FixReport:
 
 
 def combine_confidence(event: Recognition) -> float | None:
-    """Return the higher confidence of a match: alone, or given the flight so far (None: unknown)."""
+    """Return a match's own confidence or that given the flight so far, whichever is higher (None: unknown)."""
     if event.confidence is None:
         return None
     return max(event.confidence, event.track.confidence if event.track else 0.0)

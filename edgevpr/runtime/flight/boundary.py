@@ -1,8 +1,8 @@
 """The boundary of a flight, for recording and replay: if a flight is recorded or replayed, all input from clocks,
-machine, source, link and signals passes through these classes. The flight itself does not know.
+machine, source, link and signals passes through these classes, without any change to the flight itself.
 
-A line of the tape is a note: the answer to a question of some kind, or a turn of the link with its time and its steps,
-such as bytes received or a packet sent.
+A line of the tape is an input: a value of some kind, such as a clock reading, or a turn of the link with its time and
+its steps, such as bytes received or a packet sent.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ from edgevpr.runtime.flight.stop import Stop
 
 T = TypeVar("T")
 
-# The attributes of a source that change, and their values in a replay where the tape has none.
+# The attributes of a source that change, and their values in a replay if the tape lacks them.
 SOURCE_STATE_DEFAULTS = {
     "ended": False,
     "dropped": 0,
@@ -47,8 +47,8 @@ _STEPS = {
     Conversation.handle_port_loss.__name__: "lost",
     Conversation.end.__name__: "closed",
 }
-LINK = "link"  # the kind of the turns of the link
-_UNRECORDED_FIELDS = "image", "position", "pose"  # of a frame, not written to the tape as they are
+LINK = "link"  # kind of the link's turns
+_UNRECORDED_FIELDS = "image", "position", "pose"  # fields of a frame that the tape lacks, or has in another form
 
 
 class Tape:
@@ -56,11 +56,11 @@ class Tape:
     `kind` is the name of the input, such as "frame"."""
 
     def read(self, kind: str, measure: Callable[[], T]) -> T:
-        """Get a value of the input `kind` by `measure`, and record it; in a replay return the recorded value."""
+        """Return the result of `measure`, and record it as input `kind`; in a replay, return the recorded value."""
         raise NotImplementedError
 
     def note(self, kind: str, *values: Any) -> None:
-        """Record values that were not obtained by `read`; may be called from any thread."""
+        """Record values that were not read with `read`. May be called from any thread."""
 
 
 def tape_clock(clock: Clock, tape: Tape) -> Clock:
@@ -80,7 +80,7 @@ _MEASUREMENTS: dict[str, tuple[str, type[Any] | None]] = {
 
 
 def tape_machine(machine: Machine, tape: Tape) -> Machine:
-    """Return the same machine with each answer recorded on the `tape`, or played back from it."""
+    """Return the same machine with each measurement recorded on the `tape`, or played back from it."""
     return cast(Machine, _TapedMachine(machine, tape))
 
 
@@ -124,8 +124,8 @@ class TapedStop(Stop):
 
 class RecordedSource(Source):
     """A source that records the frames of `source`, and its attributes (see `Source`) whenever one is read.
-    `store_jpeg` stores the JPEG of a frame and returns the number under which it is stored. The flight works with the
-    image decoded from that JPEG, so that a replay has the flight's images to the last bit."""
+    `store_jpeg` stores the JPEG of a frame and returns its number. The flight uses the
+    image decoded from that JPEG, so a replay has exactly the images of the flight."""
 
     def __init__(self, source: Source, tape: Tape, store_jpeg: Callable[[bytes], int]) -> None:
         self.is_live, self.total = source.is_live, source.total
@@ -163,7 +163,7 @@ class RecordedSource(Source):
 
 
 class TapedTurns(Turns):
-    """Turns that are recorded, or played back. `steps` are those of the present turn of the link."""
+    """Turns that are recorded, or played back. `steps` are those of the current turn of the link."""
 
     def __init__(self, clock: Callable[[], float], tape: Tape) -> None:
         super().__init__(clock)
@@ -185,7 +185,7 @@ class TapedTurns(Turns):
 
 
 class RecordedDriver(PortDriver):
-    """The driver of a port that records what it does with its conversation, and its state whenever that is read."""
+    """The driver of a port that records its calls to its conversation, and its state whenever that is read."""
 
     def __init__(self, turns: TapedTurns, address: LinkAddress, conversation: Conversation, _: Turns) -> None:
         recorded = cast(Conversation, _RecordedConversation(conversation, turns))
@@ -197,7 +197,7 @@ class RecordedDriver(PortDriver):
 
 
 class _RecordedConversation:
-    """A conversation for a driver, whose calls are recorded as steps of the present turn."""
+    """A conversation for a driver, whose calls are recorded as steps of the current turn."""
 
     def __init__(self, conversation: Conversation, turns: TapedTurns) -> None:
         self._conversation, self._turns = conversation, turns
@@ -215,7 +215,7 @@ class _RecordedConversation:
             self._turns.steps.append((step, *self._describe(step, args, result)))
 
     def _describe(self, step: str, args: tuple[Any, ...], result: Any) -> tuple[Any, ...]:
-        """Return what a replay needs of a call: the bytes and their sender, the packet, the number of fixes."""
+        """Return the data of a call that a replay needs: bytes and their sender, the packet, the number of fixes."""
         match step, args:
             case "heard", (data, _, sender):
                 return data, sender, list(self._conversation.settings.signing.verdicts)

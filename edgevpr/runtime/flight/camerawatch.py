@@ -16,19 +16,19 @@ from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Accepted matches in a row that must show the rotation, and the smallest rotation to report. With this length of their
-# mean direction they agree within about ten degrees. A compass is rarely that wrong; a camera is rotated by 90 or 180.
+# Consecutive accepted matches that must show the rotation, and the smallest rotation to report. With this length of
+# their mean direction they agree within about ten degrees. A compass error is smaller; cameras are off by 90 or 180.
 _TURN_MATCHES = 10
 _MIN_TURN_DEG = 20.0
 _MIN_MEAN_LENGTH = 0.97
-_MISSES_TO_TRY = 15  # queries without a match before a mirrored image is tried; ten are common over poor ground
+_MISSES_TO_TRY = 15  # queries without a match before a mirrored image is tried; ten are common over featureless ground
 _MISSES_TO_TRY_AGAIN = 30
 _MAX_TRIES = 8  # each costs two queries
-_MIRRORED_TO_REPORT = 2  # matching tries in a row: a single one may be wrong
+_MIRRORED_TO_REPORT = 2  # consecutive matching tries: a single one may be wrong
 
 
 class TurnWatch:
-    """Reports once if images are rotated against the autopilot's heading: they are then levelled about the wrong
+    """Reports once if images are rotated relative to the autopilot's heading: they are then levelled about the wrong
     axes, and the heading prevents matches. Either `source.up_deg` or the compass is wrong."""
 
     def __init__(self, notifier: Notifier, source: SourceConfig) -> None:
@@ -37,10 +37,10 @@ class TurnWatch:
 
     def update(self, event: Recognition) -> None:
         """Process the rotation between the match of an event and the reported heading."""
-        where, view_up_deg = event.located, event.view.up_deg
-        if self._has_reported or where is None or where.heading_deg is None or view_up_deg is None or event.view.reason:
+        located, view = event.located, event.view
+        if self._has_reported or located is None or located.heading_deg is None or view.up_deg is None or view.reason:
             return
-        self._turns.append(cmath.rect(1.0, math.radians(where.heading_deg - view_up_deg)))
+        self._turns.append(cmath.rect(1.0, math.radians(located.heading_deg - view.up_deg)))
         mean = sum(self._turns) / _TURN_MATCHES
         turn_deg = math.degrees(cmath.phase(mean))
         if len(self._turns) < _TURN_MATCHES or abs(mean) < _MIN_MEAN_LENGTH or abs(turn_deg) < _MIN_TURN_DEG:
@@ -52,8 +52,8 @@ class TurnWatch:
 
 
 class MirrorWatch:
-    """Reports once if images are mirrored, for example by a camera setting: they never match. After many queries in a
-    row without a match, and none with one before, an image is tried flipped left to right, and top to bottom."""
+    """Reports once if images are mirrored, for example by a camera setting: they never match. After many consecutive
+    queries without a match, and no earlier match, an image is tried flipped left to right, and top to bottom."""
 
     def __init__(self, notifier: Notifier, recogniser: Recogniser) -> None:
         self._notifier, self._recogniser = notifier, recogniser

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# Pictures further apart overlap too little for visual odometry on an aeroplane. Additional pictures are taken between
-# such queries: at a height of 100 m and 20 m/s, they share more than half of the ground.
+# Pictures further apart overlap too little for visual odometry on a fixed-wing aircraft. Additional ones are taken
+# between such queries: at a height of 100 m and 20 m/s, more than half of their ground overlaps.
 _MAX_QUERY_INTERVAL_S = 4.0
 _ODOMETRY_INTERVAL_S = 2.0
 
@@ -24,7 +24,7 @@ class Clock:
 
 
 class Pace:
-    """Decides when to take the next frame: `rate_hz` per second, or at the intervals of a recording. After a delay it
+    """Decides when to take the next frame: at `rate_hz`, or at the intervals of a recording. After a delay it
     does not catch up."""
 
     def __init__(self, rate_hz: float, clock: Clock) -> None:

@@ -18,13 +18,13 @@ _NOTES = {
 
 
 class CompanionWatch:
-    """Reports each problem of the companion computer once when it begins and once when it is over."""
+    """Reports each problem of the companion computer once when it begins and once when it ends."""
 
     def __init__(self, notifier: Notifier) -> None:
         self._notifier = notifier
         self._last_true_s: dict[str, float] = {}  # when each problem was last reported by the board
-        self._reported_s: dict[str, float] = {}  # when each problem was last reported, as begun or as over
-        self._active: dict[str, str] = {}  # reported problems that are not over, with their texts
+        self._reported_s: dict[str, float] = {}  # when the start or end of each problem was last reported
+        self._active: dict[str, str] = {}  # reported problems that have not ended, with their texts
 
     @property
     def problems(self) -> tuple[str, ...]:

@@ -13,9 +13,9 @@ from edgevpr.runtime.recognise.locate import mahalanobis
 
 # In standard deviations: one correct fix in 3000 is farther than this from its prediction.
 _MAX_INNOVATION_SIGMA = 4.0
-# A second correct fix is within this of the first seven times in eight; otherwise the next one is.
+# A second correct fix is within this of the first in seven of eight cases; otherwise the next one is.
 _MAX_DISAGREEMENT_SIGMA = 2.0
-_HELD_FIX_TIMEOUT_S = 30.0  # a fix held for longer is not compared: the path may have drifted too far
+_HELD_FIX_TIMEOUT_S = 30.0  # a fix held for longer is dropped: the path may have drifted too far
 _CONFIRMATION_TIMEOUT_S = 2.5
 _DRIFT_M_S = 2.5  # path drift allowed between two fixes that agree
 _TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
@@ -70,12 +70,12 @@ class Consistency:
 
     def is_contradicted(self, now_s: float, is_tracked: bool) -> bool:
         """Return True while the last fix contradicts its prediction and another may still confirm it. On a path that
-        `is_tracked`, a right fix would be confirmed soon."""
+        `is_tracked`, a correct fix is confirmed soon."""
         timeout_s = _CONFIRMATION_TIMEOUT_S if is_tracked else _HELD_FIX_TIMEOUT_S
         return bool(self._agreeing) and now_s - self._agreeing[-1].match.t_s <= timeout_s
 
     def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
-        """Gate a fix by its prediction. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
+        """Gate a fix by its innovation. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
         tracked the path."""
         match, innovation_m = fix.match, fix.innovation_m
         heading_agrees = match.heading_agrees_with(self._heading_error_deg)
@@ -113,7 +113,7 @@ class Consistency:
 
 
 def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:
-    """Return by how many standard deviations the innovations of two fixes differ; infinity if over 30 s apart."""
+    """Return the difference of the innovations of two fixes in standard deviations; infinity if over 30 s apart."""
     if abs(other.match.t_s - one.match.t_s) > _HELD_FIX_TIMEOUT_S:
         return math.inf
     return mahalanobis(other.innovation_m - one.innovation_m, _sum_covariances(one, other, drift_m_s))
@@ -121,15 +121,15 @@ def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) 
 
 def _is_flyable(one: PredictedFix, other: PredictedFix) -> bool:
     """Return True if an aircraft could have flown from one fix to the other within ten seconds."""
-    apart_s = other.match.t_s - one.match.t_s
-    if not 0 < apart_s <= _MAX_ROUTE_INTERVAL_S or not other.match.heading_agrees_with(one.match.heading_error_deg):
+    elapsed_s = other.match.t_s - one.match.t_s
+    if not 0 < elapsed_s <= _MAX_ROUTE_INTERVAL_S or not other.match.heading_agrees_with(one.match.heading_error_deg):
         return False
     flown_m = float(np.hypot(*(other.path_point_m + other.offset_m - one.path_point_m - one.offset_m)))
-    return flown_m <= _MAX_SPEED_M_S * apart_s
+    return flown_m <= _MAX_SPEED_M_S * elapsed_s
 
 
 def _is_independent(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> bool:
-    """Return True if two fixes are at different places, or so far apart that one wrong position would not fit both."""
+    """Return True if two fixes are at different places, or so far apart that no one wrong position explains both."""
     if other.match.shares_no_place_with(one.match):
         return True
     flown_m = other.path_point_m + other.predicted_m - one.path_point_m - one.predicted_m

@@ -1,4 +1,4 @@
-"""A flight from start to end. Each pass of the loop reads the newest frame, recognises it, and reports the event, the
+"""A flight from start to end. Each pass of the loop reads the newest frame, recognises it, and passes the event, the
 `Recognition` of this frame, to the autopilot and to observers: functions that count, monitor and log."""
 
 import logging
@@ -38,7 +38,7 @@ from edgevpr.runtime.flight.watching import MapCoverageWatch, MapWatch, SurveyRe
 from edgevpr.runtime.preflight.pick import list_safe_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
-_MAX_WAIT_S = 0.2  # a pass of the loop waits no longer than this for a frame
+_MAX_WAIT_S = 0.2  # longest wait of one pass of the loop for a frame
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
 
 
 class Flight:
-    """A flight whose parts are open. Create it with `open`; close it after `run`."""
+    """A flight with all its parts open. Create it with `open`; close it after `run`."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class Flight:
             source = io.open_source(step_s)
             stack.callback(source.close)
             if link and not source.is_live and settings.send_fixes:
-                _log.warning("%s is a recording: its fixes are not the position of this vehicle", camera.uri)
+                _log.warning("%s is a recording: its fixes are not positions of this vehicle", camera.uri)
             notifier = Notifier(flight_log, link)
             autopilot = None
             if link:
@@ -165,7 +165,7 @@ class Flight:
         """Return remarks for the status in addition to the counts, each in a few words (None: nothing to report)."""
         held = self._governing.governor.held
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
-        return self._commands.summary, age, held, self._map_watch.summary, self._parts.flight_log.state
+        return self._commands.summary, age, held, self._map_watch.summary, self._parts.flight_log.fault
 
     def _run_pass(self) -> None:
         """Run one pass of the loop, with one frame at most."""
@@ -181,7 +181,7 @@ class Flight:
                 frame: Frame | ImageError | None = source.read(_MAX_WAIT_S)
             except ImageError as error:
                 frame = error
-        if not source.is_live:  # reading from a live source is mostly waiting
+        if not source.is_live:  # reading a live source is mostly waiting
             meter.load.add_work(reading.cost)
         if frame is None:
             return
@@ -199,7 +199,7 @@ class Flight:
                 meter.count(event)
                 self._parts.autopilot.add_motion(event)
         meter.load.add_work(work.cost)
-        self._governing.update()  # here, so each measurement covers a whole number of queries
+        self._governing.update()  # here, so that each measurement covers a whole number of queries
 
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
         """Recognise a frame or, unless `is_query`, only measure its motion; refuse frozen pictures."""
@@ -223,8 +223,8 @@ class Flight:
         return not self._commands.is_paused and self._pace.is_odometry_due() and parts.autopilot.needs_motion_frames()
 
     def _publish(self, event: Recognition) -> None:
-        """Report an event to the autopilot, then, with the report of its fix, to all observers. An exception is logged:
-        it must not end the flight."""
+        """Pass an event to the autopilot and then, with the report of its fix, to all observers. An exception is only
+        logged: it must not end the flight."""
         meter = self._parts.meter
         meter.count(event)
         with meter.measure_cost() as reporting:
@@ -234,7 +234,7 @@ class Flight:
                 elif event.accepted:
                     event = replace(event, fix=report_unsent(event, Reason(ReasonCode.NO_LINK)))
             except Exception:
-                _log.exception("the autopilot could not be informed")
+                _log.exception("the match could not be sent to the autopilot")
             for update in self._observers:
                 try:
                     update(event)
@@ -259,7 +259,7 @@ class Flight:
         )
 
     def _set_mount(self, mount: Mount) -> None:
-        """Level later pictures with this mount, and navigate by their fixes only."""
+        """Level later pictures with this mount, and use only their fixes for navigation."""
         self._parts.recogniser.change(mount=mount)
         if self._parts.autopilot:
             self._parts.autopilot.reset_navigation()
@@ -294,7 +294,7 @@ def _open_log(io: FlightIO) -> FlightLog:
 def open_link(
     settings: MavlinkConfig, io: FlightIO, navigator: Navigator, origin: Position | None, stack: ExitStack
 ) -> Link | None:
-    """Open the link to the flight controller (None: not configured), which `stack` closes."""
+    """Open the link to the flight controller; `stack` closes it. None if no link is configured."""
     if settings.link is None:
         return None
     link_settings = LinkSettings(

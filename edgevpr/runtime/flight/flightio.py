@@ -47,18 +47,18 @@ T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
-# Parameters of `mallopt` (glibc's malloc.h), bytes: how much freed memory is kept, and the size from which it is
-# returned at once. By default glibc raises both, and a flight over many places holds more than it uses. Half is slower.
+# Parameters of `mallopt` (glibc's malloc.h), bytes: how much freed memory is kept, and the size above which it is
+# returned at once. glibc raises both by default, so a flight over many places would keep memory. Half is slower.
 _MALLOC_OPTIONS = {-1: 8_000_000, -3: 4_000_000}
-_MAX_WARNING_S = 0.3
-_MAX_END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
+_MAX_WARNING_S = 0.3  # longest wait for the last log line
+_MAX_END_S = 4.0  # from a signal until a process that hangs is killed: systemd waits five seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightIO:
     """Inputs and outputs of a flight. `place_map`: path of the map; `log`: settings of the flight log; `open_source`:
     opens the source, given the seconds between two frames; `turns`, `drive` and `signing`: the link's turns, maker of
-    its driver, and packet signing; `status`: the status file; `recording`: its folder. None: there is none. All input
+    its driver, and packet signing; `status`: the status file; `recording`: its folder (None: no such file). All input
     passes here; `boundary` records it or plays it back."""
 
     board: Board
@@ -77,7 +77,7 @@ class FlightIO:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightParts:
-    """All opened parts of a flight (None: there is no such part)."""
+    """All open parts of a flight (None: there is no such part)."""
 
     recogniser: Recogniser
     source: Source
@@ -96,7 +96,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
     seconds between them (empty: they are read at the configured rate). Raises EdgevprError."""
     source = config.source
     if (uri := source.uri) is None:
-        raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
+        raise UsageError("There is no source of frames: set --source or `source: {uri: ...}`.")
     if config.mavlink.link is not None:
         parse_link(config.mavlink.link)
     board = resolve_board(load_board(config.board), source, config.memory)
@@ -113,9 +113,9 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         def open_paced(step_s: float) -> Source:
             source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
             if steps_s:
-                _log.info("%d pictures are played at their recorded times, over %.0f s", source.total, sum(steps_s))
+                _log.info("playing %d pictures at their recorded times, over %.0f s", source.total, sum(steps_s))
             elif Path(uri).is_dir():
-                _log.info("pictures are played in order at %.3g Hz, as not all have a time", 1 / step_s)
+                _log.info("playing pictures in order at %.3g Hz, because not all have a time", 1 / step_s)
             return source
 
         io = FlightIO(
@@ -155,7 +155,7 @@ def record_io(io: FlightIO, recording: Recording) -> FlightIO:
 
 
 def _open_optional(open_part: Callable[[], T]) -> T | None:
-    """Return the result of `open_part`; None, with a warning, if it fails in a service, which flies without it."""
+    """Return the result of `open_part`; None, with a warning, if it fails in a service, which can fly without it."""
     try:
         return open_part()
     except EdgevprError as error:
@@ -174,7 +174,7 @@ def _handle_signals(stop: Stop) -> Iterator[None]:
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    # Python calls `stop` in the main thread, which may hang. The signal number is written to the pipe at once.
+    # Python calls `stop` in the main thread, which may hang, but writes the signal number to the pipe at once.
     before_writer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     has_ended = threading.Event()
     watch = threading.Thread(target=_end_in_time, args=(reader, has_ended), name="end", daemon=True)
@@ -196,8 +196,8 @@ def _end_in_time(reader: int, has_ended: threading.Event) -> None:
     log is in its file by then."""
     while number := os.read(reader, 1):
         if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_MAX_END_S):
-            text = "the flight does not end by itself: ending its process"
-            # In a thread, since the hanging thread may be inside a log call.
+            text = "the flight does not stop on the signal: ending its process"
+            # In a thread, because the hanging thread may be inside a log call.
             warning = threading.Thread(target=_log.warning, args=(text,), daemon=True)
             warning.start()
             warning.join(_MAX_WARNING_S)

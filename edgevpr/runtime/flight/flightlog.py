@@ -33,7 +33,7 @@ from edgevpr.core.text import format_json_line
 Line = dict[str, Any]
 
 _log = logging.getLogger(__name__)
-_MAX_FILES = 4  # share `max_mb`: the current file and three numbered ones
+_MAX_FILES = 4  # that use `max_mb` together: the current file and three numbered ones
 _SYNC_INTERVAL_S = 1.0
 
 
@@ -41,16 +41,16 @@ class FlightLog:
     """Writer of a flight log (a context manager); with `path` None nothing is written.
 
     `path` is the log of the newest flight. The file of an earlier flight is rotated: renamed to the next number (see
-    `core.appending`), as is a file that reaches a quarter of `max_mb` (None: no limit). The numbered files share the
+    `core.appending`), as is a file that reaches a quarter of `max_mb` (None: no limit). The numbered files use the
     rest; the oldest are deleted. Each further file of a flight begins with a copy of the start line and two more
     fields: `repeated` (true) and `part`, the number of the file within the flight.
 
-    Each line is passed to the operating system at once: if this process ends, no line is lost. Lines are synced at most
-    once a second: a power cut loses the lines of the last two seconds.
+    Each line is written to the operating system at once: if this process ends, no line is lost. Lines are synced at
+    most once a second: a power cut loses the lines of the last two seconds.
 
-    `state` is None while lines are written, else a sentence with the reason; `lost_lines` counts lines that could not
-    be written. Every write tries again, and the first that succeeds is preceded by a line of kind "gap". A log that is
-    deleted or moved in flight continues in a new file.
+    `fault` is None while lines are written, else a sentence with the reason; `lost_lines` counts lines that could not
+    be written. Every write tries again, and the first that succeeds is preceded by a line of kind "gap". If the log is
+    deleted or moved in flight, logging continues in a new file.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class FlightLog:
         """Open the file. Raises EdgevprError if that fails; with `wait`, for a service that may be restarted in the
         air, every line tries again instead. `clock` returns monotonic seconds."""
         self.path = path
-        self.state: str | None = None
+        self.fault: str | None = None
         self.lost_lines = 0
         self._clock, self._utc_s = clock, utc_s
         self._path = Path(path or "")
@@ -82,8 +82,8 @@ class FlightLog:
             except OSError as error:
                 if not wait:
                     raise EdgevprError(
-                        f"The flight log {path} cannot be opened ({error.strerror}): give each flight a file of its "
-                        "own, in a folder that exists and is writable."
+                        f"The flight log {path} cannot be opened ({error.strerror}): use one file per flight, "
+                        "in a folder that exists and is writable."
                     ) from error
                 self._record_error(error)
 
@@ -99,13 +99,13 @@ class FlightLog:
         if self.path is None:
             return
         if self._file is not None and not is_same_file(self._file, self._path):
-            self._warn(f"The flight log {self._path} was deleted or moved in flight: it goes on in a new file.")
+            self._warn(f"The flight log {self._path} was deleted or moved in flight; logging continues in a new file.")
             self._close_file()
         now_s, utc_s = self._clock(), self._utc_s()
         lines, is_start = _make_line(kind, utc_s, {"t_mono_s": now_s, **fields}), kind == "start"
         if is_start:
             self._start, self._part = json.loads(lines), 0
-        if self.state is not None:
+        if self.fault is not None:
             gap = _make_line("gap", utc_s, {"t_mono_s": now_s, "lost_lines": self.lost_lines})
             lines = lines + gap if is_start else gap + lines
         try:
@@ -122,12 +122,12 @@ class FlightLog:
             self.lost_lines += 1
             self._record_error(error)
         else:
-            if self.state is not None:
-                self.state = None
-                _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
+            if self.fault is not None:
+                self.fault = None
+                _log.warning("Logging to %s has resumed; %d lines were lost.", self.path, self.lost_lines)
 
     def sync_if_due(self, now_s: float) -> None:
-        """Sync lines to the disk if a second has passed since the last sync; `now_s` is the time. Never raises."""
+        """Sync lines to the disk if the last sync was a second ago or more; `now_s` is the time. Never raises."""
         if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_INTERVAL_S:
             return
         try:
@@ -147,8 +147,8 @@ class FlightLog:
         self._file = None
 
     def _prepare_file(self, more_bytes: int) -> FileIO:
-        """Return the open file; one without room for `more_bytes`, or of an earlier flight, is rotated first. If that
-        fails, it is appended to: lines matter more than the limit. Raises OSError."""
+        """Return the open file. A file without room for `more_bytes`, or of an earlier flight, is rotated first. If
+        that fails, the file grows beyond the limit: lines matter more. Raises OSError."""
         file = self._file or self._open()
         size, is_ours = _read_size(file), _read_identity(file) == self._own_identity
         if not size or (is_ours and size + more_bytes <= self._part_bytes):
@@ -157,8 +157,8 @@ class FlightLog:
             rotate_file(self._path)
         except OSError as error:
             self._warn(
-                f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
-                "grow past log.max_mb: let the flight write to its folder."
+                f"The flight log {self.path} cannot be rotated ({error.strerror}), so it grows and may "
+                "exceed log.max_mb: make its folder writable for the flight."
             )
             return file
         sync_file(file)
@@ -173,9 +173,9 @@ class FlightLog:
         file = open_appending(self._path)
         if not try_lock(file):
             file.close()
-            raise OSError(errno.EBUSY, "another edgevpr writes it", str(self._path))
+            raise OSError(errno.EBUSY, "another edgevpr process writes to it", str(self._path))
         self._file = file
-        if not _read_size(file):  # on another medium it may have the same numbers as an earlier file
+        if not _read_size(file):  # on another disk, its device and inode may equal those of an earlier file
             self._own_identity = None
             sync_folder(self._path)
         return file
@@ -186,12 +186,12 @@ class FlightLog:
 
     def _record_error(self, error: OSError) -> None:
         """Record that the file cannot be written. The next line reopens it, since the card may have been replaced."""
-        if self.state is None:
-            self.state = (
-                f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
-                "the flight goes on without it."
+        if self.fault is None:
+            self.fault = (
+                f"The flight log {self.path} cannot be written ({error.strerror}): free space or insert the card; "
+                "the flight continues without it."
             )
-            _log.warning("%s", self.state)
+            _log.warning("%s", self.fault)
         self._close_file()
 
     def _close_file(self) -> None:
@@ -222,7 +222,7 @@ def _make_line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
 
 
 def _read_identity(file: FileIO) -> tuple[int, int]:
-    """Return the device and inode numbers of an open file, which no other existing file has."""
+    """Return the device and inode numbers of an open file, which identify it."""
     status = os.fstat(file.fileno())
     return status.st_dev, status.st_ino
 
@@ -255,7 +255,7 @@ def _parse_line(line: bytes) -> Line | None:
 class FlightLines:
     """The lines of one flight, read from its `files`; iterate over them as often as needed. `flight` identifies it by
     its start line: (time in UTC, time on the monotonic clock), None without one. `missing` is a sentence about missing
-    files (None: none is missing)."""
+    files (None: the flight is complete)."""
 
     files: tuple[Path, ...]
     flight: tuple[object, object] | None
@@ -281,9 +281,9 @@ def select_last_flight(path: str | Path) -> FlightLines:
     Raises UsageError if there is no such file, and EdgevprError if it contains no flight-log lines."""
     path = Path(path)
     if not path.is_file():
-        raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
+        raise UsageError(f"There is no flight log {path}: use the file that is set as `log.path`.")
     if not any(isinstance(line.get("kind"), str) for line in read_log(path)):
-        raise EdgevprError(f"{path} contains no flight-log lines: give a log written by a flight.")
+        raise EdgevprError(f"{path} contains no flight-log lines: use a log written by a flight.")
     starts = _read_starts(path)
     if not starts:
         return FlightLines(files=(path,), flight=None, missing=None)
@@ -297,7 +297,7 @@ def select_last_flight(path: str | Path) -> FlightLines:
                     if numbers and min(numbers) < min(parts[path]):
                         parts[other] = numbers
     missing_count = max(parts[path]) - sum(map(len, parts.values()))
-    missing = f"Files of the flight that are missing before {path}: {missing_count}. The flight is read without them."
+    missing = f"Files of this flight before {path} are missing ({missing_count}): it is read without them."
     files = tuple(sorted(parts, key=lambda file: min(parts[file])))
     return FlightLines(files=files, flight=flight, missing=missing if missing_count > 0 else None)
 

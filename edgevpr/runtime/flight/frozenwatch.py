@@ -1,10 +1,10 @@
-"""Detects frozen images. While the aircraft moves, images that stay the same are frozen, whatever noise, clock or
-display they show, and so are those that repeat earlier ones of this flight, as from a clip that is played again.
+"""Detects frozen images. While the aircraft moves, images that do not change are frozen, even if noise, a clock or a
+display hides this. So are images that repeat earlier ones of this flight, as from a clip that is played again.
 
-Both equal an earlier image, although the aircraft has turned or flown so far that they cannot. Rotation is the best
-evidence, since gyroscopes measure it for every camera. Velocity times time over height is the second, for a camera that
-looks down, as far as an autopilot that follows our own positions can be trusted. An image whose texture cannot show a
-motion, as over water, in fog or in the dark, is not judged.
+Both equal an earlier image, although the aircraft has turned or flown too far for that. Rotation is the best
+evidence, because gyroscopes measure it for every camera. Velocity times time over height is the second, for a camera
+that looks down, as far as an autopilot that follows our own positions can be trusted. An image whose texture cannot
+show a motion, as over water, in fog or in the dark, is not judged.
 """
 
 import math
@@ -25,51 +25,51 @@ from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-# Motions are shares of the image's longest side. A motion of 0.012 is detected.
-MIN_MOTION_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved image
-MIN_PROOF_SHARE = 0.09  # sum of such motions that proves images frozen: one reset of the heading is no proof
-_MAX_SINGLE_SHARE = 0.04  # most that one rotation, or one repeated image, counts
+# Motions are fractions of the image's longest side. A motion of 0.012 is detected.
+MIN_MOTION = 0.03  # least motion by the aircraft that contradicts an unmoved image
+MIN_PROOF = 0.09  # sum of such motions that proves images frozen: one reset of the heading is no proof
+_MAX_SINGLE_MOTION = 0.04  # limit for one rotation, or one repeated image
 _PROOF_WINDOW_S = 20.0
-_MIN_FROZEN_S = 2.5  # for which images stay the same, or between an image and its repetition
-# So many repeated images in a row, in flight, are a proof by themselves: on a route that is flown again, 500 m high
+_MIN_FROZEN_S = 2.5  # of unchanged images, or between an image and its repetition
+# This many consecutive repeated images in flight are sufficient proof: on a route that is flown again, at 500 m
 # with a gimbal, one image in five equals an earlier one to within the resolution.
 _MIN_REPEATS = 8
-_ROTATION_ERROR_DEG = 2.0  # attitude, and time of the frame
-_SPEED_ERROR_M_S = 2.0  # less counts as hovering
-_PATH_DRIFT_M_S = 6.0  # of a path of a minute, as the wind changes
+_ROTATION_ERROR_DEG = 2.0  # due to attitude and time of the frame
+_SPEED_ERROR_M_S = 2.0  # a lower speed counts as hovering
+_PATH_DRIFT_M_S = 6.0  # of a path over a minute, due to changing wind
 _MIN_FLIGHT_SPEED_M_S = 3.0
-_MAX_HEIGHT_RATIO = 1.5  # the ground may be lower than the height says
+_MAX_HEIGHT_RATIO = 1.5  # the ground may be lower than the reported height implies
 _MAX_SPEED_M_S = 100.0  # a larger reported velocity is wrong
-_MAX_HEIGHT_M = 10_000.0  # and so is a height
-_MIN_HEIGHT_M = 5.0  # a smaller height over ground is too uncertain
+_MAX_HEIGHT_M = 10_000.0  # a larger reported height is wrong
+_MIN_HEIGHT_M = 5.0  # a smaller height above ground is too uncertain
 _MAX_STEP_S = 5.0  # between images; the velocity is not integrated over a longer time
-_HEADING_JUMP_DEG = 30.0  # a larger change of heading, with the next for each second, is a correction by the autopilot
+_HEADING_JUMP_DEG = 30.0  # a larger change of heading (plus the next, per second) is a correction by the autopilot
 _HEADING_JUMP_DEG_S = 60.0
-_RMS_RADIUS_SHARE = 0.36  # root mean square distance of an image's points from its middle
-_MAX_FOV_DEG = 120.0  # assumed of an unknown lens
-_MIN_SAME_SHARE = 0.75  # share of the blocks that must be unmoved
+_RMS_RADIUS = 0.36  # root mean square distance of an image's points from its centre
+_MAX_FOV_DEG = 120.0  # assumed for an unknown lens
+_MIN_UNMOVED_FRACTION = 0.75  # of the blocks of the same image
 _MIN_BLOCKS = BLOCK_COUNT // 3  # that can be judged
-_STATIC_MEMORY = 8  # images: time constant of the share of images in which a block stays while most others move
-_MAX_STATIC_SHARE = 0.5  # of the blocks, in an image from which the blocks that always stay are learnt
+_STATIC_MEMORY = 8  # images: time constant of the fraction of images in which a block stays while most others move
+_MAX_STATIC_FRACTION = 0.5  # of the blocks, in an image used to find the blocks that never move
 _MAX_REMEMBERED = 300  # images; 4 MB
 _REMEMBER_INTERVAL_S = 0.5
-_MIN_THUMB_CORRELATION = 0.97  # least correlation of the coarsest copies
+_MIN_THUMB_CORRELATION = 0.97  # of the coarsest copies
 _MAX_CANDIDATES = 3  # earlier images that are compared block by block
 _NEW_AFTER_UNCHANGED = 3  # new images after which the camera counts as back
-_NEW_AFTER_REPEATS = 10  # the same, after a clip
+_NEW_AFTER_REPEATS = 10  # the same, after a repeated clip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Optics:
-    """The effect of the aircraft's motion on the images of its camera. `focal_share`: focal length in shares of the
-    image's longest side. `looks_down`: else ahead. `is_level`: a gimbal compensates roll and pitch."""
+    """The effect of the aircraft's motion on the images of its camera. `focal`: focal length as a fraction of the
+    image's longest side. `looks_down`: False if it looks ahead. `is_level`: a gimbal compensates roll and pitch."""
 
-    focal_share: float
+    focal: float
     looks_down: bool
     is_level: bool
 
-    def compute_rotation_share(self, earlier: Vehicle | None, now: Vehicle | None) -> float:
-        """Return the least motion of an image by the rotation of the aircraft between two reports; 0 if unknown."""
+    def compute_rotation_motion(self, earlier: Vehicle | None, now: Vehicle | None) -> float:
+        """Return the least motion of an image due to the aircraft's rotation between two reports; 0 if unknown."""
         if earlier is None or now is None:
             return 0.0
         names = "roll_deg", "pitch_deg", "heading_deg"
@@ -77,29 +77,29 @@ class Optics:
         if self.is_level:
             roll_deg = pitch_deg = 0.0
         across_deg, about_deg = (roll_deg, yaw_deg) if self.looks_down else (yaw_deg, roll_deg)
-        shift = self.focal_share * _subtract_error(math.hypot(across_deg, pitch_deg))
-        return math.hypot(min(1.0, shift), _RMS_RADIUS_SHARE * _subtract_error(about_deg))
+        shift = self.focal * _subtract_error(math.hypot(across_deg, pitch_deg))
+        return math.hypot(min(1.0, shift), _RMS_RADIUS * _subtract_error(about_deg))
 
-    def compute_travel_share(self, moved_m: float, height_m: float | None) -> float:
+    def compute_travel_motion(self, moved_m: float, height_m: float | None) -> float:
         """Return the least motion of an image if the aircraft has moved by `moved_m`; 0 if the camera does not look
         down, or the height is unknown."""
         if not self.looks_down or height_m is None or not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
             return 0.0
-        return max(0.0, moved_m) * self.focal_share / (_MAX_HEIGHT_RATIO * height_m)
+        return max(0.0, moved_m) * self.focal / (_MAX_HEIGHT_RATIO * height_m)
 
 
 def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
     """Return the optics of a configured camera; an unknown lens is assumed to be the widest usual one."""
     lens = read_camera_lens(source)
-    focal_share = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _MAX_FOV_DEG) / 2)
+    focal = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _MAX_FOV_DEG) / 2)
     looks_down = recogniser.technique.spec.looks_down
-    return Optics(focal_share=focal_share, looks_down=looks_down, is_level=source.gimbal)
+    return Optics(focal=focal, looks_down=looks_down, is_level=source.gimbal)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedImage:
-    """An image with the report of the aircraft at its time (`vehicle`; None: none). `path_m` (2,): displacement since
-    the start of the flight, by velocities, metres east and north."""
+    """An image with the autopilot's report at its time (`vehicle`; None: no report). `path_m` (2,): displacement since
+    the start of the flight, integrated from velocities, metres east and north."""
 
     image: CoarseImage
     t_s: float
@@ -109,8 +109,8 @@ class TimedImage:
 
 class FrozenWatch:
     """Judges each image of a live camera before it is recognised, and reports once when images are frozen
-    (`is_frozen`) and once when they move again. Some have been recognised by then, so the navigation of the `autopilot`
-    (None: there is no link) is reset, and no position that is sent depends on them."""
+    (`is_frozen`) and once when they change again. Some have been recognised by then, so the navigation of the
+    `autopilot` (None: no link) is reset, so that no position sent later depends on them."""
 
     def __init__(self, notifier: Notifier, optics: Optics, autopilot: AutopilotOutput | None = None) -> None:
         self.is_frozen = False
@@ -118,10 +118,10 @@ class FrozenWatch:
         self._run_start: TimedImage | None = None  # first of a run of equal images
         self._newest: TimedImage | None = None
         self._rotation_start: Vehicle | None = None
-        self._travel_share = 0.0
-        self._rotations: deque[tuple[float, float]] = deque()  # of this run: time and share of each
+        self._travel_motion = 0.0
+        self._rotations: deque[tuple[float, float]] = deque()  # in this run: time and motion of each
         self._repeats: deque[tuple[float, float]] = deque()
-        self._static_shares = np.zeros(BLOCK_COUNT)  # of the latest images: a block stayed while others moved
+        self._static_fractions = np.zeros(BLOCK_COUNT)  # of recent images in which a block stayed while others moved
         self._remembered: deque[TimedImage] = deque(maxlen=_MAX_REMEMBERED)
         self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
 
@@ -164,20 +164,20 @@ class FrozenWatch:
         return TimedImage(image=image, t_s=t_s, vehicle=vehicle, path_m=path_m)
 
     def _start_run(self, now: TimedImage) -> None:
-        self._run_start, self._rotation_start, self._travel_share = now, now.vehicle, 0.0
+        self._run_start, self._rotation_start, self._travel_motion = now, now.vehicle, 0.0
         self._rotations.clear()
         last = self._remembered[-1] if self._remembered else None
         if last is None or now.t_s - last.t_s >= _REMEMBER_INTERVAL_S:
             self._remembered.append(replace(now, image=CoarseImage(now.image.grey)))
 
     def _handle_same(self, first: TimedImage, now: TimedImage) -> None:
-        """Process an image that equals the first one of its run."""
+        """Process an image that equals the first one of its run of equal images."""
         self._new_in_a_row = 0
-        self._travel_share = max(self._travel_share, self._compute_travel_share(first, now, _SPEED_ERROR_M_S))
-        rotation_share = self._optics.compute_rotation_share(self._rotation_start, now.vehicle)
-        if rotation_share >= MIN_MOTION_SHARE:
-            self._rotations.append((now.t_s, min(rotation_share, _MAX_SINGLE_SHARE)))
-        if rotation_share >= MIN_MOTION_SHARE or self._rotation_start is None:
+        self._travel_motion = max(self._travel_motion, self._compute_travel_motion(first, now, _SPEED_ERROR_M_S))
+        rotation_motion = self._optics.compute_rotation_motion(self._rotation_start, now.vehicle)
+        if rotation_motion >= MIN_MOTION:
+            self._rotations.append((now.t_s, min(rotation_motion, _MAX_SINGLE_MOTION)))
+        if rotation_motion >= MIN_MOTION or self._rotation_start is None:
             self._rotation_start = now.vehicle
 
     def _find_repeat(self, now: TimedImage) -> bool:
@@ -187,7 +187,7 @@ class FrozenWatch:
         correlations = np.array([remembered.image.thumb for remembered in self._remembered]) @ now.image.thumb
         for index in np.argsort(correlations)[: -_MAX_CANDIDATES - 1 : -1].tolist():
             earlier = self._remembered[index]
-            # A copy without blocks, here and where it is kept: the blocks of all remembered images would take 20 MB.
+            # Copies are stored and compared without blocks: the blocks of all remembered images would take 20 MB.
             is_similar = correlations[index] >= _MIN_THUMB_CORRELATION
             if is_similar and self._is_same(CoarseImage(earlier.image.grey), now.image):
                 self._handle_repeat(earlier, now)
@@ -200,35 +200,35 @@ class FrozenWatch:
             return
         velocity_m_s = _read_velocity(now.vehicle)
         is_flying = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
-        if is_flying and self._optics.looks_down:  # the horizon ahead stays the same for long
+        if is_flying and self._optics.looks_down:  # the horizon ahead looks the same for a long time
             self._repeats_in_a_row += 1
-        rotation_share = self._optics.compute_rotation_share(earlier.vehicle, now.vehicle)
-        share = max(rotation_share, self._compute_travel_share(earlier, now, _PATH_DRIFT_M_S))
-        if share >= MIN_MOTION_SHARE:
-            self._repeats.append((now.t_s, min(share, _MAX_SINGLE_SHARE)))
+        rotation_motion = self._optics.compute_rotation_motion(earlier.vehicle, now.vehicle)
+        motion = max(rotation_motion, self._compute_travel_motion(earlier, now, _PATH_DRIFT_M_S))
+        if motion >= MIN_MOTION:
+            self._repeats.append((now.t_s, min(motion, _MAX_SINGLE_MOTION)))
 
-    def _compute_travel_share(self, earlier: TimedImage, now: TimedImage, speed_error_m_s: float) -> float:
+    def _compute_travel_motion(self, earlier: TimedImage, now: TimedImage, speed_error_m_s: float) -> float:
         moved_m = float(np.hypot(*(now.path_m - earlier.path_m))) - speed_error_m_s * (now.t_s - earlier.t_s)
-        return self._optics.compute_travel_share(moved_m, now.vehicle.height_m if now.vehicle else None)
+        return self._optics.compute_travel_motion(moved_m, now.vehicle.height_m if now.vehicle else None)
 
     def _is_same(self, earlier: CoarseImage, now: CoarseImage, updates_static: bool = False) -> bool | None:
-        """Return True if two images show the same, unmoved; None if their texture cannot show a motion. Blocks that
-        always stay, as those of a display or of the airframe, are not used; with `updates_static`, they are learnt."""
+        """Return True if two images are the same, unmoved; None if their texture cannot show a motion. Blocks that
+        never move, as on a display or the airframe, are not used; with `updates_static`, they are updated."""
         textured, unmoved = earlier.is_textured, earlier.find_unmoved_blocks(now)
-        judged = textured & (self._static_shares < _MAX_STATIC_SHARE)
-        if updates_static and unmoved.sum() <= _MAX_STATIC_SHARE * textured.sum():
-            self._static_shares += textured * (unmoved - self._static_shares) / _STATIC_MEMORY
-        return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _MIN_SAME_SHARE)
+        judged = textured & (self._static_fractions < _MAX_STATIC_FRACTION)
+        if updates_static and unmoved.sum() <= _MAX_STATIC_FRACTION * textured.sum():
+            self._static_fractions += textured * (unmoved - self._static_fractions) / _STATIC_MEMORY
+        return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _MIN_UNMOVED_FRACTION)
 
     def _update_verdict(self, now_s: float) -> None:
-        """Decide, by the motions of the last seconds that the images did not show, whether images are frozen."""
+        """Decide whether images are frozen, from the motions of the last seconds that the images did not show."""
         for motions in (self._rotations, self._repeats):
             while motions and now_s - motions[0][0] > _PROOF_WINDOW_S:
                 motions.popleft()
         unchanged_s = now_s - self._run_start.t_s if self._run_start else 0.0
-        motion_share = self._travel_share + sum(share for _, share in self._rotations)
-        is_repeating = sum(share for _, share in self._repeats) >= MIN_PROOF_SHARE
-        if motion_share >= MIN_PROOF_SHARE and unchanged_s >= _MIN_FROZEN_S:
+        motion = self._travel_motion + sum(rotation for _, rotation in self._rotations)
+        is_repeating = sum(repeat for _, repeat in self._repeats) >= MIN_PROOF
+        if motion >= MIN_PROOF and unchanged_s >= _MIN_FROZEN_S:
             self._report(_NEW_AFTER_UNCHANGED)
         elif is_repeating or self._repeats_in_a_row >= _MIN_REPEATS:
             self._report(_NEW_AFTER_REPEATS)
@@ -267,7 +267,7 @@ def _subtract_error(angle_deg: float) -> float:
 
 
 def _has_jumped(last: TimedImage, vehicle: Vehicle | None, t_s: float) -> bool:
-    """Return True if the heading has changed faster than an aircraft turns."""
+    """Return True if the heading has changed faster than an aircraft can turn."""
     if last.vehicle is None or vehicle is None:
         return False
     rotation_deg = abs(_compute_change_deg(last.vehicle, vehicle, "heading_deg"))

@@ -1,4 +1,4 @@
-"""The governor keeps CPU share, memory and temperature within the board's profile. It first compares fewer candidates,
+"""The governor keeps CPU load, memory and temperature within the board's profile. It first compares fewer candidates,
 which costs few matches, then makes fewer queries per second, and steps back up when resources are free.
 
 It steps up only if the load, scaled to the higher setting, stays clearly below every limit. If a step up soon had to be
@@ -17,18 +17,18 @@ from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.metering import LoadReading
 
 GOVERN_INTERVAL_S = 1.0
-_MIN_EXCEEDED_S = 3.0  # how long a limit must be exceeded before anything changes
+_MIN_EXCEEDED_S = 3.0  # a limit must be exceeded for this long before anything changes
 _MIN_HEAT_WAIT_S = 20.0  # after a change: a hot board cools slowly, so the effect shows late
-_MIN_WAIT_S = 6.0  # how long the load must be below all limits before a step up
+_MIN_WAIT_S = 6.0  # the load must be below all limits for this long before a step up
 _MAX_WAIT_S = 600.0
-_STEP_UP_TRIAL_S = 300.0  # a step up that lasts this long was right
-_MAX_EXPECTED_SHARE = 0.85  # largest share of a limit for the load expected at the higher setting
-_MAX_LATE_SHARE = 0.95
+_STEP_UP_TRIAL_S = 300.0  # a step up that lasts this long was successful
+_MAX_EXPECTED_LOAD = 0.85  # expected at the higher setting, as a fraction of a limit
+_MAX_LATE_FRACTION = 0.95
 _TEMPERATURE_MARGIN_C = 5.0
-_MAX_MEMORY_SHARE = 0.95
-_MAX_HEADROOM_MEMORY_SHARE = 0.9
-_MAX_RATE_DIVISOR = 8  # the rate falls to no less than the configured one divided by this
-_COMPARE_SHARE = 0.6  # share of a query's time spent comparing candidates, in a large map (benchmarks/results/arm64.md)
+_MAX_MEMORY_FRACTION = 0.95
+_MAX_HEADROOM_MEMORY = 0.9
+_MAX_RATE_DIVISOR = 8  # the lowest rate is the configured one divided by this
+_COMPARE_FRACTION = 0.6  # of a query's time is spent comparing candidates, in a large map (benchmarks/results/arm64.md)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Setting:
 @dataclass(frozen=True, slots=True)
 class Change:
     """Change from the setting `before` to `after`, and why. `back`: the change is upwards. The settings are equal if a
-    limit is exceeded and no setting is left to lower."""
+    limit is exceeded and no lower setting is left."""
 
     before: Setting
     after: Setting
@@ -90,17 +90,17 @@ class Governor:
         return f"held to {', '.join(filter(None, parts))}" if now != full else None
 
     def update(self, now_s: float, reading: LoadReading) -> Change | None:
-        """Process the measurement of one second, which must cover a whole number of queries; return the change to
+        """Process a measurement over one second and a whole number of queries; return the change to
         make."""
         hot, exceeded = self._check_load(reading)
         max_mb = self._board.memory_max_mb
         has_headroom = self._has_headroom(reading, self._settings[max(0, self._index - 1)])
         exceeded_s = self._measure_held_s("exceeded", now_s, exceeded is not None)
         headroom_s = self._measure_held_s("headroom", now_s, has_headroom)
-        full_s = self._measure_held_s("full", now_s, reading.rss_mb >= _MAX_MEMORY_SHARE * max_mb)
+        full_s = self._measure_held_s("full", now_s, reading.rss_mb >= _MAX_MEMORY_FRACTION * max_mb)
         if has_headroom:
             self._reported.discard("load")
-        if reading.rss_mb <= _MAX_HEADROOM_MEMORY_SHARE * max_mb:
+        if reading.rss_mb <= _MAX_HEADROOM_MEMORY * max_mb:
             self._reported.discard("memory")
         if full_s >= _MIN_EXCEEDED_S and "memory" not in self._reported:
             return self._report_limit(
@@ -118,21 +118,21 @@ class Governor:
             return self._change(now_s, self._index - 1, Reason(ReasonCode.RESOURCES_FREE), back=True)
         return None
 
-    def _measure_held_s(self, what: str, now_s: float, holds: bool) -> float:
-        """Record whether the condition `what` holds now; return for how many seconds it has held without a break."""
+    def _measure_held_s(self, name: str, now_s: float, holds: bool) -> float:
+        """Record whether the condition `name` holds now; return for how many seconds it has held without a break."""
         if not holds:
-            self._since_s.pop(what, None)
+            self._since_s.pop(name, None)
             return 0.0
-        return now_s - self._since_s.setdefault(what, now_s)
+        return now_s - self._since_s.setdefault(name, now_s)
 
     def _find_lower(self, hot: bool) -> int | None:
-        """Return the index of the next lower setting; if `hot`, of the next with a lower rate, which cools sooner."""
+        """Return the index of the next lower setting; if `hot`, of the next with a lower rate, which cools faster."""
         lower = range(self._index + 1, len(self._settings))
         slower = [index for index in lower if self._settings[index].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else lower), None)
 
     def _check_load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
-        """Return whether the board is too hot, and the exceeded limit (None: none)."""
+        """Return whether the board is too hot, and the exceeded limit (None: none is exceeded)."""
         max_share, temperature_c = self._board.cpu_share, reading.temperature_c
         if temperature_c is not None and temperature_c >= self._limit_c:
             return True, Reason(ReasonCode.BOARD_HOT, {"temperature_c": temperature_c, "limit_c": self._limit_c})
@@ -140,26 +140,26 @@ class Governor:
             return True, Reason(ReasonCode.BOARD_THROTTLED)
         if reading.cpu_share > max_share:
             return False, Reason(ReasonCode.CPU_OVER_LIMIT, {"cpu_share": reading.cpu_share, "max_share": max_share})
-        if reading.late_share > _MAX_LATE_SHARE:
+        if reading.late_share > _MAX_LATE_FRACTION:
             return False, Reason(ReasonCode.QUERIES_LATE)
         return False, None
 
     def _has_headroom(self, reading: LoadReading, higher: Setting) -> bool:
         """Return True if the load would stay clearly below all limits with the setting `higher`."""
         current, board = self.setting, self._board
-        factor = 1 + _COMPARE_SHARE * (higher.candidates / current.candidates - 1)
+        factor = 1 + _COMPARE_FRACTION * (higher.candidates / current.candidates - 1)
         factor *= higher.rate_hz / current.rate_hz
         return (
-            reading.cpu_share * factor <= _MAX_EXPECTED_SHARE * board.cpu_share
-            and reading.late_share * factor <= _MAX_EXPECTED_SHARE
+            reading.cpu_share * factor <= _MAX_EXPECTED_LOAD * board.cpu_share
+            and reading.late_share * factor <= _MAX_EXPECTED_LOAD
             and not reading.throttled
             and (reading.temperature_c is None or reading.temperature_c <= self._limit_c - _TEMPERATURE_MARGIN_C)
-            and reading.rss_mb <= _MAX_HEADROOM_MEMORY_SHARE * board.memory_max_mb
+            and reading.rss_mb <= _MAX_HEADROOM_MEMORY * board.memory_max_mb
         )
 
-    def _report_limit(self, what: str, why: Reason) -> Change:
-        """Return a change between equal settings: a limit ("memory" or "load") is exceeded, but none is lowered."""
-        self._reported.add(what)
+    def _report_limit(self, limit: str, why: Reason) -> Change:
+        """Return a change between equal settings: a limit ("memory" or "load") is exceeded, but nothing is lowered."""
+        self._reported.add(limit)
         return Change(self.setting, self.setting, why)
 
     def _step_down(self, now_s: float, index: int, why: Reason) -> Change:
@@ -200,7 +200,7 @@ class GovernorActuator:
         text = gcs_text = self.governor.held or "back to the configured settings"
         severity = Severity.INFO if change.back else Severity.NOTICE
         if change.before == change.after:
-            text = "over a limit of the board, and nothing is left to lower"
+            text = "over a limit of the board, and no lower setting is left"
             gcs_text, severity = "over a limit of its board, see its log", Severity.WARNING
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
         parts.notifier.log("governor", **fields)

@@ -13,21 +13,23 @@ from edgevpr.runtime.recognise.recognition import Recognition
 MIN_CONTRADICTION_RATIO = 1.25
 MIN_CORRECTION_RATIO = 1.1  # a larger error is corrected; five matches scatter by less
 MATCHES_IN_A_ROW = 5
-_GROUND_CHANGE_SHARE = 0.3  # of the height: how much further ground that rises or falls may change between matches
-MIN_HEIGHT_M = 1.0  # lower heights, as on the ground, are compared as if they were this
+_GROUND_CHANGE = 0.3  # further change of rising or falling ground between matches, as a fraction of the height
+MIN_HEIGHT_M = 1.0  # lower heights, as on the ground, are raised to this before comparing
 
 
 class HeightWatch:
     """Reports once when the heights of five matches in a row contradict the reported one, and once when five agree
     again. A match gives a height only if the lens is known. The `autopilot` (None: there is no link) gets the ratio.
 
-    `image_height_m`, `autopilot_height_m`: medians of the last five matches (None: they do not contradict)."""
+    `image_height_m`, `autopilot_height_m`: medians over the last five matches (None: the heights agree)."""
 
     def __init__(self, notifier: Notifier, autopilot: AutopilotOutput | None = None) -> None:
         self.image_height_m: float | None = None
         self.autopilot_height_m: float | None = None
         self._notifier, self._autopilot = notifier, autopilot
-        self._heights_m: deque[tuple[float, float]] = deque(maxlen=MATCHES_IN_A_ROW)  # by pictures, by the autopilot
+        self._heights_m: deque[tuple[float, float]] = deque(
+            maxlen=MATCHES_IN_A_ROW
+        )  # from pictures, from the autopilot
         self._last_s: float | None = None
 
     @property
@@ -35,19 +37,16 @@ class HeightWatch:
         """Visual height divided by the autopilot's, median of the last five matches; 1.0 unless all five deviate in the
         same direction."""
         ratios = self._ratios
-        is_off = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(MIN_CORRECTION_RATIO, ratios)
-        return statistics.median(ratios) if is_off else 1.0
+        is_wrong = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(MIN_CORRECTION_RATIO, ratios)
+        return statistics.median(ratios) if is_wrong else 1.0
 
     @property
     def ratio_sd(self) -> float:
         """Relative error of `ratio`: the deviation of the newest match, for example where the ground begins to fall or
-        rise, plus its further change. 0.0: within the scatter of matches."""
+        rise, plus its further change. 0.0 within the scatter of matches."""
         change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
-        return (
-            0.0
-            if 1 / MIN_CORRECTION_RATIO <= change <= MIN_CORRECTION_RATIO
-            else abs(change - 1.0) + _GROUND_CHANGE_SHARE
-        )
+        is_scatter = 1 / MIN_CORRECTION_RATIO <= change <= MIN_CORRECTION_RATIO
+        return 0.0 if is_scatter else abs(change - 1.0) + _GROUND_CHANGE
 
     @property
     def _ratios(self) -> list[float]:
@@ -55,14 +54,14 @@ class HeightWatch:
 
     def update(self, event: Recognition) -> None:
         """Compare the height of an event's match, if it has one, with the reported height."""
-        frame, vehicle, where = event.frame, event.vehicle, event.located
-        if frame is None or vehicle is None or where is None or not event.accepted or event.view.reason:
+        frame, vehicle, located = event.frame, event.vehicle, event.located
+        if frame is None or vehicle is None or located is None or not event.accepted or event.view.reason:
             return
-        is_known = where.height_m and where.height_ratio and vehicle.height_m is not None
+        is_known = located.height_m and located.height_ratio and vehicle.height_m is not None
         if not is_known or frame.t_mono_s == self._last_s or not vehicle.is_fresh(frame.t_mono_s):
             return
         self._last_s = frame.t_mono_s
-        self._heights_m.append((max(MIN_HEIGHT_M, where.height_m or 0.0), max(MIN_HEIGHT_M, vehicle.height_m or 0.0)))
+        self._heights_m.append((max(MIN_HEIGHT_M, located.height_m or 0.0), max(MIN_HEIGHT_M, vehicle.height_m or 0.0)))
         if self._autopilot:
             self._autopilot.correct_height(self.ratio, self.ratio_sd)
         self._judge()

@@ -31,4 +31,4 @@ class Machine:
 
     def is_written(self, flight_log: FlightLog) -> bool:
         """Return True if the last line of a flight log was written."""
-        return flight_log.state is None
+        return flight_log.fault is None

@@ -16,15 +16,15 @@ from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviation of a reported attitude, as a tangent: half a degree, which a filter averages over many frames. The
-# GPS watch allows twice as much: a false alarm costs the aircraft its GPS, and successive matches in one turn share
-# their error.
+# GPS watch allows twice as much: after a false alarm GPS is not used, and successive matches in one turn have
+# the same error.
 ATTITUDE_SD = math.tan(math.radians(0.5))
 CAUTIOUS_ATTITUDE_SD = math.tan(math.radians(1.0))
 RECEIVER_LAG_SD_S = 0.1  # standard deviation of a receiver's lag, whose mean is `receivers.RECEIVER_LAG_S`
 _UNKNOWN_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
 _UNKNOWN_SPEED_M_S = 15.0  # assumed if the aircraft reports none
 _MAX_HEIGHT_RATIO = 2.0  # beyond it, odometry is discarded instead of scaled
-_CORRELATION_LENGTH_SHARE = 0.25  # of the footprint: closer fixes share errors due to changed ground
+_CORRELATION_LENGTH = 0.25  # of the footprint: closer fixes have common errors due to changed ground
 _MAX_HEADING_CHANGE_DEG = 45.0  # largest change of the compass error between two fixes
 
 
@@ -46,7 +46,7 @@ class FrameMeasurement:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionedMatch:
     """An accepted match with a position. `frame`: its frame; `position`: the aircraft's position at that time;
-    `accuracy_m`: the accuracy to send; `covariance_m2` (2, 2): without the error that all fixes share and the frame's;
+    `accuracy_m`: the accuracy to send; `covariance_m2` (2, 2): without the frame's error and that common to all fixes;
     `places`: numbers of the matched places; `attitude_error`: measured in the picture (None: unknown);
     `heading_error_deg`: the heading measured in the picture minus the autopilot's (None: unknown)."""
 
@@ -65,15 +65,15 @@ class PositionedMatch:
 
     @property
     def scatter_m2(self) -> Doubles:
-        """Covariance (2, 2) without the error that all fixes share."""
+        """Covariance (2, 2) without the error common to all fixes."""
         return self.covariance_m2 + self.frame.sd_m**2 * np.eye(2)
 
     def shares_no_place_with(self, other: "PositionedMatch") -> bool:
-        """Return True if no place of this match is one of the other's."""
+        """Return True if the two matches have no place in common."""
         return set(self.places).isdisjoint(other.places)
 
     def heading_agrees_with(self, heading_error_deg: float | None) -> bool:
-        """Return True if the compass error is about `heading_error_deg` here too, or if either is unknown."""
+        """Return True if the compass error here is also about `heading_error_deg`, or if either is unknown."""
         if self.heading_error_deg is None or heading_error_deg is None:
             return True
         return abs(wrap_deg(self.heading_error_deg - heading_error_deg)) <= _MAX_HEADING_CHANGE_DEG
@@ -104,12 +104,12 @@ def measure_frame(
         attitude_gain_s2=0.0 if is_unaffected else height_m / GRAVITY_M_S2,
         odometry=event.odometry.scale(height_ratio) if event.odometry and can_scale else None,
         scale_sd=max(abs(height_ratio - 1.0), height_ratio_sd),
-        correlation_length_m=_CORRELATION_LENGTH_SHARE * (event.view.footprint_m or 0.0),
+        correlation_length_m=_CORRELATION_LENGTH * (event.view.footprint_m or 0.0),
     )
 
 
 def measure_for_gps(event: Recognition, vehicle: Vehicle) -> PositionedMatch | None:
-    """Return the match of an event, with the errors of a comparison with a GPS receiver; None if there is none."""
+    """Return the match of an event, with the errors of a comparison with a GPS receiver; None without a match."""
     if event.frame is None:
         return None
     t_sd_s = math.hypot(RECEIVER_LAG_SD_S, event.frame.t_sd_s)
@@ -136,8 +136,8 @@ def flown_accuracy_m(event: Recognition, vehicle: Vehicle, frame: FrameMeasureme
 
 
 def shared_time_error_m(event: Recognition, vehicle: Vehicle | None) -> float:
-    """Return the standard deviation (metres) of the position error that frames share if their times are less accurate
-    than usual. It has one direction, so averaging over frames does not reduce it."""
+    """Return the standard deviation (metres) of the position error common to frames if their times are less accurate
+    than usual. It is always along the flight, so averaging over frames does not reduce it."""
     t_sd_s = event.frame.t_sd_s if event.frame else 0.0
     velocity_m_s = vehicle and vehicle.velocity_m_s
     speed_m_s = math.hypot(*velocity_m_s) if velocity_m_s else _UNKNOWN_SPEED_M_S

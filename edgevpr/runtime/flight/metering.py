@@ -1,4 +1,4 @@
-"""What a flight uses of its board: charge, CPU time, memory, heat."""
+"""Meters what a flight uses of its board: charge, CPU time, memory, heat."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
-    """One measurement for the governor. `cpu_share` (0..1): share of all cores used by this process since the last
-    measurement. `late_share` (0..1): share of that time spent on queries if other programs or the disk delayed them,
+    """One measurement for the governor. `cpu_share` (0..1): fraction of all cores used by this process since the last
+    measurement. `late_share` (0..1): fraction of that time spent on queries if other programs or the disk delayed them,
     else 0. `rss_mb`: memory of this process. The rest describes the board (None: unknown)."""
 
     cpu_share: float

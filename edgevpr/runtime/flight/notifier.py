@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class Notifier:
-    """Reports what happens in a flight. Without a `link` nothing is sent to the ground station."""
+    """Reports the events of a flight. Without a `link`, nothing is sent to the ground station."""
 
     def __init__(self, flight_log: FlightLog, link: Link | None) -> None:
         self._flight_log, self._link = flight_log, link
@@ -30,8 +30,8 @@ class Notifier:
         self._flight_log.write(kind, **fields)
 
     def announce(self, severity: Severity, text: str, *, gcs_text: str | None = None, topic: str | None = None) -> None:
-        """Write a text to the journal, and queue it for the ground station (the shorter text `gcs_text` instead, if
-        given). A queued text is replaced by a newer one of the same `topic`."""
+        """Write a text to the journal, and queue it, or the shorter `gcs_text`, for the ground station. A queued text
+        is replaced by a newer one of the same `topic`."""
         _log.log(logging.INFO if severity is Severity.INFO else logging.WARNING, "%s", text)
         if self._link:
             self._link.announce(severity, gcs_text or text, topic)
@@ -56,7 +56,7 @@ class Notifier:
 
 
 class Alert:
-    """Reports a bad condition once when it begins (`onset`), and once when it ends (`cleared`). `kind`: kind of its
+    """Reports a fault once when it begins (`onset`), and once when it ends (`cleared`). `kind`: kind of its
     lines in the flight log."""
 
     def __init__(self, notifier: Notifier, kind: str, onset: Reason, cleared: ReasonCode) -> None:
@@ -85,7 +85,7 @@ class Commands:
         return "paused" if self.is_paused else None
 
     def obey(self) -> None:
-        """Carry out the request received since the last call, then let the link accept new requests."""
+        """Carry out the request received since the last call, if any, then let the link accept new requests."""
         if self._link is None:
             return
         if request := self._link.take_command():

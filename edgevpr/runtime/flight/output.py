@@ -1,4 +1,4 @@
-"""What a continuous channel sends, and the watch that stops it: an autopilot that flies by our positions follows
+"""What a continuous channel sends, and the watch that stops it: an autopilot that uses our positions follows
 their errors."""
 
 import math
@@ -14,24 +14,25 @@ _MAX_INNOVATION_RATIO = 1.0  # innovation over the gate of the autopilot's filte
 _MIN_REFUSED_S = 3.0
 _MAX_ESTIMATE_ERROR_M = 15.0  # distance between the autopilot's estimate and a good receiver; at least this
 _MAX_ESTIMATE_ERROR_SD = 4.0
-_MIN_LED_AWAY_S = 2.0
+_MIN_DRIFT_OFF_S = 2.0
 _MIN_STEADY_S = 3.0
 INFLUENCE_S = 10.0  # how long our last position may affect the estimate of an autopilot that has GPS
 
 
 class Output(Enum):
-    """What is sent, with the severity and the text (41 bytes at most) for the ground station."""
+    """What is sent, with severity and text (41 bytes at most) for the ground station. RESERVE is a fallback: while GPS
+    is in use, positions are sent with such a large error that the autopilot prefers its receiver."""
 
     STARTING = Severity.INFO, "position not known yet"
     SENDING = Severity.WARNING, "no GPS: positions are sent"
-    BESIDE_GPS = Severity.INFO, "positions are sent beside GPS"
-    RESERVE = Severity.INFO, "GPS in use: positions are a reserve"
+    BESIDE_GPS = Severity.INFO, "GPS in use: positions are sent too"
+    RESERVE = Severity.INFO, "GPS in use: positions sent as fallback"
     GPS_BACK = Severity.INFO, "GPS is back: no positions"
     GPS_IN_USE = Severity.INFO, "GPS in use: no positions"
-    UNKNOWN = Severity.WARNING, "position unknown: none is sent"
-    CONTRADICTS_GPS = Severity.WARNING, "position contradicts GPS: none is sent"
-    LEADS_AWAY = Severity.WARNING, "autopilot led off GPS: none is sent"
-    REFUSED = Severity.WARNING, "autopilot refuses positions: none is sent"
+    UNKNOWN = Severity.WARNING, "position unknown: nothing is sent"
+    CONTRADICTS_GPS = Severity.WARNING, "position contradicts GPS: nothing sent"
+    LEADS_AWAY = Severity.WARNING, "autopilot drifts off GPS: nothing sent"
+    REFUSED = Severity.WARNING, "autopilot refuses positions: not sent"
 
     @property
     def is_sent(self) -> bool:
@@ -54,7 +55,7 @@ class OutputWatch:
         self.withdrawn: Output | None = None
         self._withdrawn_s = -math.inf
         self._sent_s = -math.inf
-        self._refused_since_s = self._led_away_since_s = math.inf
+        self._refused_since_s = self._drift_off_since_s = math.inf
 
     def record_sent(self, t_s: float) -> None:
         """Record that a position was sent at `t_s`."""
@@ -64,17 +65,17 @@ class OutputWatch:
         """Process a report from the autopilot. `match_s`: time of the last accepted fix; `has_gps`: there is a trusted
         receiver."""
         now_s = vehicle.t_received_s
-        is_led_away = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= INFLUENCE_S
+        drifts_off = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= INFLUENCE_S
         is_over_gate = (vehicle.innovation_ratio or 0.0) > _MAX_INNOVATION_RATIO
         is_refused = is_over_gate and not has_gps and now_s - self._sent_s <= 1.0
-        self._led_away_since_s = min(self._led_away_since_s, now_s) if is_led_away else math.inf
+        self._drift_off_since_s = min(self._drift_off_since_s, now_s) if drifts_off else math.inf
         self._refused_since_s = min(self._refused_since_s, now_s) if is_refused else math.inf
         is_proven = now_s - match_s <= MATCH_PROOF_S
-        if now_s - self._led_away_since_s >= _MIN_LED_AWAY_S and not is_proven:
+        if now_s - self._drift_off_since_s >= _MIN_DRIFT_OFF_S and not is_proven:
             self.withdrawn, self._withdrawn_s = Output.LEADS_AWAY, now_s
         elif now_s - self._refused_since_s >= _MIN_REFUSED_S and not is_proven:
             self.withdrawn, self._withdrawn_s = Output.REFUSED, now_s
-        elif match_s > self._withdrawn_s or (has_gps and not is_led_away and now_s - self._withdrawn_s > INFLUENCE_S):
+        elif match_s > self._withdrawn_s or (has_gps and not drifts_off and now_s - self._withdrawn_s > INFLUENCE_S):
             self.withdrawn = None
 
 
@@ -84,5 +85,5 @@ def _is_off_receiver(vehicle: Vehicle) -> bool:
     if receiver is None or receiver.steady_for_s < _MIN_STEADY_S:
         return False
     receiver_deg = extrapolate(receiver, vehicle.t_received_s)
-    off_m = float(distance_m(*receiver_deg, vehicle.lat_deg, vehicle.lon_deg))
-    return off_m > max(_MAX_ESTIMATE_ERROR_M, _MAX_ESTIMATE_ERROR_SD * receiver.sd_m)
+    error_m = float(distance_m(*receiver_deg, vehicle.lat_deg, vehicle.lon_deg))
+    return error_m > max(_MAX_ESTIMATE_ERROR_M, _MAX_ESTIMATE_ERROR_SD * receiver.sd_m)

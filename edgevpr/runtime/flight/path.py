@@ -1,5 +1,5 @@
 """The path of an aircraft: its velocities or accelerations integrated from a known position. It never jumps, so
-offsets from it can be compared at any two times; the position that an autopilot reports jumps at each correction."""
+offsets from it at different times can be compared; the position that an autopilot reports jumps at each correction."""
 
 import math
 from bisect import bisect_left
@@ -26,7 +26,7 @@ class Point:
 
 
 class Path:
-    """The points of the last seconds of a path that began at `origin` with a velocity (2,); the last one is `now`.
+    """The points of the last seconds of a path that began at `origin` with a velocity (2,); `now` is the newest.
     `is_broken`: there was a gap of over a second between two points."""
 
     def __init__(self, origin: Position, t_s: float, velocity_m_s: Doubles) -> None:
@@ -64,8 +64,8 @@ class Path:
         return self.add_velocity(t_s, last.velocity_m_s + step_s * np.asarray(acceleration_m_s2, float))
 
     def interpolate(self, t_s: float) -> Point | None:
-        """Return the point at `t_s`; after the last point, its velocity continues. None if `t_s` is before the first
-        point kept or more than a second after the last."""
+        """Return the point at `t_s`, extrapolated with the last velocity. None if `t_s` is before the first
+        stored point or more than a second after the last."""
         if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _MAX_STEP_S:
             return None
         after = bisect_left(self._points, t_s, key=lambda point: point.t_s)
@@ -76,9 +76,9 @@ class Path:
             return self._points[0]
         start, end = self._points[after - 1], self._points[after]
         step_s = end.t_s - start.t_s
-        share = (t_s - start.t_s) / step_s
-        velocity_m_s = start.velocity_m_s + share * (end.velocity_m_s - start.velocity_m_s)
-        position_m = start.position_m + share * step_s / 2 * (start.velocity_m_s + velocity_m_s)
+        fraction = (t_s - start.t_s) / step_s
+        velocity_m_s = start.velocity_m_s + fraction * (end.velocity_m_s - start.velocity_m_s)
+        position_m = start.position_m + fraction * step_s / 2 * (start.velocity_m_s + velocity_m_s)
         return Point(t_s, position_m, velocity_m_s)
 
 

@@ -2,7 +2,7 @@
 `frames/`, the pictures as JPEG.
 
 A separate thread writes, so a slow disk does not delay queries. A recording with a gap cannot be replayed: if the disk
-is too slow or full, or the recording too large, it ends and the flight goes on.
+is too slow or full, or the recording too large, it ends and the flight continues.
 """
 
 import errno
@@ -27,7 +27,7 @@ from edgevpr.runtime.flight.flightlog import Line, select_last_flight
 
 TAPE = "tape.jsonl"
 FRAMES = "frames"
-MIN_FREE_BYTES = 100_000_000  # left free on the disk for logs and map
+MIN_FREE_BYTES = 100_000_000  # to leave free on the disk for logs and map
 MAX_QUEUED_BYTES = 32_000_000  # limit of queued pictures while the disk is slow: minutes of a small camera
 MAX_QUEUED_NOTES = 100_000
 _WRITE_INTERVAL_S = 0.5  # a power cut loses the input since the last write
@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 class Recording(Tape):
     """An open recording (a context manager) in the folder `path`: the `Tape` of all input, and frames. `state` is None
-    while recording, else a sentence with the reason for its end."""
+    while recording, then a sentence with the reason for its end."""
 
     def __init__(self, folder: str | Path, max_mb: float) -> None:
         """Create a folder for this flight in `folder`. Earlier recordings there may use half of `max_mb`, the oldest
@@ -60,7 +60,7 @@ class Recording(Tape):
             self._tape = open_appending(self.path / TAPE)
         except OSError as error:
             raise EdgevprError(
-                f"Cannot record in {folder} ({error.strerror}): set `log.record` to a writable folder, or leave it out."
+                f"Cannot record in {folder} ({error.strerror}): set `log.record` to a writable folder, or remove it."
             ) from error
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
@@ -78,13 +78,13 @@ class Recording(Tape):
         return value
 
     def note(self, kind: str, *values: Any) -> None:
-        """Record an event on the tape. May be called from any thread and from a signal handler; never blocks."""
+        """Record an input on the tape. May be called from any thread and from a signal handler; never blocks."""
         if self.state is None:
             line = json.dumps([kind, *values], default=lambda data: b64encode(data).decode())
             self._queue.append(redact_passwords(line).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
-        """Record a picture, and return its number in this recording (1, 2, ...), by which `frame_path` finds it."""
+        """Record a picture, and return its number in this recording (1, 2, ...), for `frame_path`."""
         self._frames += 1
         if self.state is None:
             self._bytes_queued += len(jpeg)
@@ -96,7 +96,7 @@ class Recording(Tape):
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
         if self._thread.is_alive():
-            _log.warning("The recording %s lacks its end: the disk is too slow.", self.path)
+            _log.warning("The end of the recording %s is missing: the disk is too slow.", self.path)
 
     # The methods below run in the recording's own thread.
 
@@ -109,7 +109,7 @@ class Recording(Tape):
         except OSError as error:
             self.state = (
                 f"The recording {self.path} has ended ({error.strerror}). It can be replayed up to here; the flight "
-                "goes on."
+                "continues."
             )
             _log.warning("%s", self.state)
         finally:
@@ -120,7 +120,7 @@ class Recording(Tape):
     def _write(self) -> None:
         """Write the queue, frames before the lines that refer to them. Raises OSError if the recording must end."""
         if self._bytes_queued - self._bytes_written > MAX_QUEUED_BYTES or len(self._queue) > MAX_QUEUED_NOTES:
-            raise OSError(errno.EIO, "the disk is too slow for it")
+            raise OSError(errno.EIO, "the disk is too slow")
         notes = []
         for _ in range(len(self._queue)):
             item = self._queue.popleft()
@@ -150,7 +150,7 @@ class Recording(Tape):
                 return
             shutil.rmtree(folder)
             del sizes[folder]
-            _log.info("deleted the recording %s, to make room for this flight's", folder)
+            _log.info("deleted the recording %s to free space for this flight", folder)
 
 
 def frame_path(folder: Path, number: int) -> Path:
@@ -159,8 +159,8 @@ def frame_path(folder: Path, number: int) -> Path:
 
 
 def find_recording(folder_name: str | None, log: str | Path) -> Path | None:
-    """Return the folder of the recording `folder_name` of a `log` (None: not recorded): at that path, or in a folder of
-    that name next to the log; None if it is in neither."""
+    """Return the folder of the recording `folder_name` of a `log` (None: not recorded): at that path, or in a folder
+    with that name next to the log; None if it is at neither."""
     if not folder_name:
         return None
     path = Path(folder_name)
@@ -177,10 +177,10 @@ def read_recorded(log: str | Path) -> tuple[list[Line], Path]:
     lines = list(flight)
     folder_name = lines[0].get("recording") if lines else None
     if not folder_name:
-        raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
+        raise UsageError(f"The last flight of {log} was not recorded: set `log: {{record: FOLDER}}` before the flight.")
     folder = find_recording(folder_name, log)
     if folder is None:
-        raise UsageError(f"{log}: its recording is neither at {folder_name} nor next to the log: copy it there.")
+        raise UsageError(f"The recording of {log} is neither at {folder_name} nor next to the log: copy it there.")
     return lines, folder
 
 
@@ -197,7 +197,7 @@ def list_frames(folder: Path) -> dict[str, Path]:
 
 
 def has_live_source(folder: Path) -> bool:
-    """Return True if the pictures of the recording in `folder` came live from a camera or stream."""
+    """Return True if the pictures of the recording in `folder` are from a live camera or stream."""
     with open(folder / TAPE, "rb") as tape:
         return any(line.startswith(b'["is_live", true') for line in tape)
 

@@ -7,7 +7,7 @@ from edgevpr.runtime.flight.navigation import NavState
 
 MAX_CORRECTION_M_S = 2.0  # ArduPilot did not follow a jump of 25 m for 8 s
 # At a larger lag the position jumps. The autopilot's filter rejects the jump for seven to ten seconds, then resets to
-# it: sooner than the slew would make up the lag, and nothing far from the estimate is sent meanwhile.
+# it: sooner than the slew would remove the lag, and nothing far from the estimate is sent meanwhile.
 MAX_LAG_M = 40.0
 
 
@@ -32,13 +32,13 @@ class Slew:
             return *self._position_deg, 0.0
         step_s = max(0.0, estimate.t_s - self._last.t_s)
         east_m_s, north_m_s = estimate.velocity_m_s
-        moved_on = offset_position(*self._position_deg, step_s * east_m_s, step_s * north_m_s)
-        east_m, north_m = offset_m(*moved_on, target.lat_deg, target.lon_deg)
+        predicted_deg = offset_position(*self._position_deg, step_s * east_m_s, step_s * north_m_s)
+        east_m, north_m = offset_m(*predicted_deg, target.lat_deg, target.lon_deg)
         lag_m = math.hypot(east_m, north_m)
         if lag_m > MAX_LAG_M:
             self.reset()
             return self.follow(estimate)
-        share = min(1.0, MAX_CORRECTION_M_S * step_s / lag_m) if lag_m > 0 else 1.0
+        gain = min(1.0, MAX_CORRECTION_M_S * step_s / lag_m) if lag_m > 0 else 1.0
         self._last = estimate
-        self._position_deg = offset_position(*moved_on, share * float(east_m), share * float(north_m))
-        return *self._position_deg, (1 - share) * lag_m
+        self._position_deg = offset_position(*predicted_deg, gain * float(east_m), gain * float(north_m))
+        return *self._position_deg, (1 - gain) * lag_m

@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 def open_map(config: Config, io: FlightIO) -> Recogniser:
-    """Open the recogniser of a flight, metered with the clock of the flight. Raises EdgevprError."""
+    """Open the recogniser of a flight, metered with the clocks of the flight. Raises EdgevprError."""
     meter = QueryMeter(
         io.board,
         config.battery,
@@ -96,8 +96,8 @@ def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str,
 
 
 def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:
-    """Return the fields of a flight log's first line (kind "start"): all that a flight depends on, except its input."""
-    loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
+    """Return the fields of a flight log's first line (kind "start"): all that affects a flight, except its input."""
+    versions = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
     return {
         "version": __version__,
         "technique": spec.name,
@@ -106,7 +106,7 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
         "board": board_name,
         "machine": platform.machine(),
         "python": platform.python_version(),
-        "libraries": {name: version for name, version in loaded.items() if version},
+        "libraries": {name: version for name, version in versions.items() if version},
         "map": config.map,
         "map_identity": _identity(place_map),
         "config": asdict(config),

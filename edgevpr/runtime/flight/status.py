@@ -30,7 +30,7 @@ class StatusFile:
         except OSError as error:
             raise EdgevprError(
                 f"The status file {path} cannot be created ({error.strerror or error}): set status.file to a path in "
-                "an existing, writable folder, or leave it out."
+                "an existing, writable folder, or remove it."
             ) from error
 
     def __enter__(self) -> "StatusFile":
@@ -67,12 +67,12 @@ def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
         return None
     except OSError as error:
         raise EdgevprError(
-            f"The status file {path} cannot be read ({error.strerror}): run as its owner or group (or with sudo), or "
-            "name another file with --file."
+            f"The status file {path} cannot be read ({error.strerror}): run as its owner or in its group (or "
+            "with sudo), or use another file with --file."
         ) from error
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise EdgevprError(
-            f"{path} is not a status file of this version of edgevpr: use the version that flies."
+            f"{path} is not a status file of this version of edgevpr: use the version that runs the flight."
         ) from error
     return status, age_s
 

@@ -41,7 +41,7 @@ class Stop:
 
     @contextmanager
     def allow_interrupt(self) -> Iterator[None]:
-        """Context manager: a signal interrupts the enclosed work with StopNow."""
+        """Context manager: a signal interrupts the enclosed code with StopNow."""
         self._is_interruptible = True
         try:
             yield

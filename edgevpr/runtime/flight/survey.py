@@ -1,8 +1,8 @@
 """The survey of map and camera: while GPS is good, a flight estimates the offset of the map from GPS, the map's scale
 error, and the camera mount.
 
-The offset of a match from the receiver is the sum of all three. They vary differently: the map's offset is
-constant, the mount's turns with the heading and grows with the height, the scale's grows across the map. If a
+The offset of a match from the receiver is the sum of their effects. These vary differently: the map's offset is
+constant, the mount's rotates with the heading and grows with the height, the scale's grows across the map. If a
 flight cannot separate two of them, the standard deviations of both are large, and neither is reported.
 
 With a wrong mount, receiver and map contradict each other as soon as the aircraft turns. So matches are also used while
@@ -29,18 +29,18 @@ _MIN_INTERVAL_S = 5.0  # between two samples
 _MAX_SAMPLES = 720  # the newest hour of matches
 # GPS errors are correlated: matches within this time share one error, and count as one sample of it.
 _GPS_CORRELATION_S = 180.0
-_MAX_GPS_SD_M = 5.0  # a receiver that claims more is too inaccurate to survey a map by
-_FIX_INFLUENCE_S = 60.0  # how long a fix of ours may affect the autopilot's position: the receiver is used then
-_COMMON_TILT_SD_DEG = 0.3  # of a mount: shared by all pictures of a flight
+_MAX_GPS_SD_M = 5.0  # a receiver that claims more is too inaccurate to survey a map
+_FIX_INFLUENCE_S = 60.0  # our fix may affect the autopilot's position for this long: then the receiver is used
+_COMMON_TILT_SD_DEG = 0.3  # of a mount: common to all pictures of a flight
 # Prior standard deviations of offset (2, metres), mount (2, tangents), scale, and of the time between frames and
-# positions (s), which on a straight line has the effect of a camera that looks ahead.
+# positions (s), which on a straight track has the effect of a camera that looks ahead.
 _PRIOR_INFORMATION = np.diag(1 / np.square([1e4, 1e4, 0.5, 0.5, 0.02, 0.1]))
 _MIN_SAMPLES = 20
-_MIN_INLIER_SHARE = 0.7
+_MIN_INLIER_FRACTION = 0.7
 _MAX_RESIDUAL_SD = 4.0  # of an inlier
-# If some matches were taken while GPS was distrusted: the share of the others in each half of the flight, the standard
-# deviation of the offset by one half, and the difference of both halves.
-_MIN_TRUSTED_SHARE = 0.1
+# If some matches were taken while GPS was distrusted: the fraction of the others in each half of the flight, the
+# standard deviation of the offset from one half, and the difference between the halves.
+_MIN_TRUSTED_FRACTION = 0.1
 _MAX_HALF_SD_M = 2.0
 _MAX_HALVES_SD = 4.0
 _MAX_TRUSTED_M = 12.0  # a match closer to GPS, given the mount, is no reason to distrust GPS
@@ -54,7 +54,7 @@ _RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))  # of a Rayleigh distribution with
 class SurveySample:
     """A match `off_m` (2,) metres east and north of GPS: the product of `jacobian` (2, 6) and the parameters. The
     variance of each axis, m2, is the sum of `independent_m2` and `correlated_m2`, an error that `correlation` samples
-    have in common. `distrusts_gps`: GPS was distrusted then."""
+    have in common. `distrusts_gps`: GPS was distrusted at that time."""
 
     jacobian: Doubles
     off_m: Doubles
@@ -67,7 +67,7 @@ class SurveySample:
 @dataclass(frozen=True, slots=True)
 class SurveyMeasure:
     """A result with its standard deviation (of each axis), known if that is at most `max_sd`. Values that differ by
-    less than `min_difference` count as the same."""
+    less than `min_difference` count as equal."""
 
     value: tuple[float, ...]
     sd: float
@@ -86,15 +86,15 @@ class SurveyMeasure:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyResult:
     """The result of `matches` matches. Its `measures` by name: `off_m`, the offset of the map from GPS (east, north) at
-    the `middle` of the ground that they cover; `scale`, the fraction by which the map is too large around there;
-    `ahead_deg` and `right_deg`, by how much the camera looks ahead and to the right of straight down."""
+    the `middle` of the ground that they cover; `scale`, the fraction by which the map is too large around it;
+    `ahead_deg` and `right_deg`, the angles by which the camera looks ahead and to the right of straight down."""
 
     matches: int
     middle: Position
     measures: dict[str, SurveyMeasure]
 
     def fields(self) -> dict[str, Any]:
-        """Return this result as fields of the flight log; what is not known well enough is null."""
+        """Return this result as fields of the flight log; values that are not accurate enough are null."""
         fields: dict[str, Any] = {"matches": self.matches}
         fields["middle"] = {"lat_deg": round(self.middle.lat_deg, 7), "lon_deg": round(self.middle.lon_deg, 7)}
         for name, measure in self.measures.items():
@@ -105,7 +105,7 @@ class SurveyResult:
 
 
 class MapSurvey:
-    """Collects samples. `mount`: mount by which pictures are levelled. `is_level`: the camera is on a gimbal."""
+    """Collects samples. `mount`: mount used to level pictures. `is_level`: the camera is on a gimbal."""
 
     def __init__(self, mount: Mount, is_level: bool) -> None:
         self._mount, self._is_level = mount, is_level
@@ -121,7 +121,7 @@ class MapSurvey:
             return False
         if vehicle is None or vehicle.gps is None or vehicle.gps.sd_m > _MAX_GPS_SD_M or not is_gps_aided(vehicle):
             return False
-        # Without a view or a pose, the point under the camera is not known to within metres.
+        # Without a view or a pose, the point below the camera is not known to within metres.
         if located is None or located.heading_deg is None or view.reason:
             return False
         if view.nadir_offset is None and view.nadir_offset_m is None:
@@ -132,7 +132,7 @@ class MapSurvey:
         jacobian = self._compute_jacobian(vehicle, height_m, match.heading_error_deg or 0.0) if match else None
         if match is None or jacobian is None or not vehicle.is_fresh(t_s):
             return False
-        # The autopilot's position, since it knows the lag of its receiver.
+        # The autopilot's position, because the autopilot knows the lag of its receiver.
         reference = Position(vehicle.lat_deg, vehicle.lon_deg)
         if t_s - vehicle.t_fix_s <= _FIX_INFLUENCE_S:
             reference = Position(*extrapolate(vehicle.gps, t_s, vehicle.velocity_m_s or (0.0, 0.0)))
@@ -156,7 +156,7 @@ class MapSurvey:
         return True
 
     def set_mount(self, mount: Mount) -> None:
-        """Set the mount by which the next pictures are levelled, and convert the samples to it."""
+        """Set the mount used to level the next pictures, and convert the samples to it."""
         change = _compute_tangents(mount) - _compute_tangents(self._mount)
         shifted = [replace(sample, off_m=sample.off_m - sample.jacobian[:, 2:4] @ change) for sample in self._samples]
         self._mount, self._samples = mount, deque(shifted, maxlen=_MAX_SAMPLES)
@@ -170,7 +170,7 @@ class MapSurvey:
             return None
         heading, roll, pitch = (math.radians(angle or 0.0) for angle in (vehicle.heading_deg, roll_deg, pitch_deg))
         heading += math.radians(heading_error_deg)
-        ahead_m, right_m = height_m * math.cos(roll), height_m * math.cos(pitch)  # a banking airframe turns it too
+        ahead_m, right_m = height_m * math.cos(roll), height_m * math.cos(pitch)  # a bank rotates the mount too
         east, north = vehicle.velocity_m_s or (0.0, 0.0)
         return np.array(
             [
@@ -188,7 +188,8 @@ class MapSurvey:
         middle_m = np.mean([sample.jacobian[:, 4] for sample in samples], axis=0)
         to_middle = np.eye(6)
         to_middle[:2, 4] = middle_m
-        if is_inlier.mean() < _MIN_INLIER_SHARE or not _is_gps_plausible(samples, is_inlier, to_middle, solution[2:4]):
+        is_scattered = is_inlier.mean() < _MIN_INLIER_FRACTION
+        if is_scattered or not _is_gps_plausible(samples, is_inlier, to_middle, solution[2:4]):
             return None
         solution, covariance = to_middle @ solution, to_middle @ covariance @ to_middle.T
         sd = np.sqrt(np.diag(covariance))
@@ -246,9 +247,9 @@ def _is_gps_plausible(samples: list[SurveySample], is_inlier: Bools, to_middle: 
     residual_m = np.array([sample.off_m - sample.jacobian[:, 2:4] @ mount for sample in samples])
     distrusted &= np.linalg.norm(residual_m, axis=1) > _MAX_TRUSTED_M
     halves = np.array_split(np.arange(len(samples)), 2)
-    if min(np.mean(~distrusted[half]) for half in halves) < _MIN_TRUSTED_SHARE:
+    if min(np.mean(~distrusted[half]) for half in halves) < _MIN_TRUSTED_FRACTION:
         return False
-    if is_inlier[~distrusted].mean() < _MIN_INLIER_SHARE:
+    if is_inlier[~distrusted].mean() < _MIN_INLIER_FRACTION:
         return False
     first, second = (fit_samples([samples[index] for index in half])[:2] for half in halves)
     covariances = [to_middle @ covariance @ to_middle.T for _, covariance in (first, second)]

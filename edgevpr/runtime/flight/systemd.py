@@ -1,4 +1,4 @@
-"""Messages to systemd (sd_notify(3)): `KEY=value` lines in one datagram to $NOTIFY_SOCKET. If unset, none is sent."""
+"""Messages to systemd (sd_notify(3)): `KEY=value` lines in one datagram to $NOTIFY_SOCKET, if that is set."""
 
 import os
 import socket

@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 class Vitals:
     """Pings the systemd watchdog while queries arrive, or a reported condition explains why none does. Reports the
-    state once a second, and once a minute also to a terminal. It notifies once when the camera is lost, frozen, damaged
+    state once a second, and once a minute also on a terminal. Notifies once when the camera is lost, frozen, damaged
     or blank, when recognition keeps failing, when this computer is hot, throttled or under-voltage, and when each of
     these is over. `remarks` returns sentences for the status (None: omitted)."""
 
@@ -117,22 +117,22 @@ class Vitals:
         condition = source.condition
         fault = _FAULTS.get(condition)
         if condition is Condition.OPENING and self._report_due_s - self._start_s > _CAMERA_START_TIMEOUT_S:
-            fault = "gives no picture yet"
+            fault = "has no picture yet"
         if fault == self._source_fault:
             return
         self._source_fault = fault
-        is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state gives the cause
+        is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state is the cause
         self._parts.notifier.log("source", condition=condition.name, state=source.state, refused=source.refused)
         severity = Severity.WARNING if fault else Severity.INFO
         gcs_text = f"camera {fault or 'is back'}{f': {source.state}' if is_unopened else ''}"
         self._parts.notifier.announce(severity, f"source: {source.state}", gcs_text=gcs_text, topic="source")
 
     def _check_log(self) -> None:
-        """Report to the ground station if the log cannot be written, and when it can; the journal has the cause."""
+        """Report to the ground station when logging fails and when it resumes; the journal has the cause."""
         has_log = self._parts.io.machine.is_written(self._parts.flight_log)
         if has_log != self._has_log:
             self._has_log = has_log
-            text = f"flight log {'is written again' if has_log else 'cannot be written'}"
+            text = f"flight log {'has resumed' if has_log else 'cannot be written'}"
             if self._parts.link:
                 self._parts.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 

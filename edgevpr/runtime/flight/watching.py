@@ -16,19 +16,19 @@ from edgevpr.runtime.flight.survey import MapSurvey, SurveyMeasure, SurveyResult
 from edgevpr.runtime.recognise.levelling import read_mount
 from edgevpr.runtime.recognise.recognition import Recognition
 
-MAX_FAILURES_IN_A_ROW = 10  # a single one may be a bad frame
+MAX_FAILURES_IN_A_ROW = 10  # a single failure may be a bad frame
 MAX_BLANK_IN_A_ROW = 10  # pictures with too little texture
 
 _MIN_ON_MAP = 3  # accepted matches before the aircraft counts as over the map, and can leave it
-_MAX_MISSES = 30  # queries in a row that are not accepted; ten are common over poor ground
+_MAX_MISSES = 30  # consecutive queries that are not accepted; ten are common over featureless ground
 _LOST_PROBABILITY = 0.9
 _MAX_LOST_MISSES = 10  # the same, if the place filter considers the aircraft lost in each of them
 _MIN_TO_RETURN = 2  # accepted matches after which the aircraft counts as over the map again
 _MAX_MISSES_BETWEEN = 10  # between two such matches
-_MIN_TILT_S = 5.0  # longer than a gust, and than a reversal from one turn to the next
+_MIN_TILT_S = 5.0  # longer than a gust or a reversal of the turn
 _SURVEY_INTERVAL = 6  # samples between two evaluations of the survey
 _MOUNT_NAMES = "ahead_deg", "right_deg"
-_REPEAT_FACTOR = 3.0  # times `min_difference`: a reported result that has changed by more is reported again
+_REPEAT_FACTOR = 3.0  # a reported result that has changed by this many `min_difference` is reported again
 
 _log = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ class MapWatch:
 
 
 class MapCoverageWatch:
-    """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that is over. The
+    """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that ends. The
     map counts as left after many consecutive queries that are not accepted, not counting pictures that cannot be
     recognised."""
 
@@ -130,9 +130,9 @@ class MapCoverageWatch:
 
 
 class SurveyReporter:
-    """Reports the results of `survey`: each when it is known and deviates from what is expected, again when it has
+    """Reports the results of `survey`: each when it is known and deviates from the expected value, again when it has
     clearly changed, and all at the end. Results for the map are withdrawn if GPS turns out to be wrong. `set_mount` is
-    called with the mount by which to level the next pictures."""
+    called with the mount to be used to level the next pictures."""
 
     def __init__(
         self, notifier: Notifier, gps: GpsWatch, source: SourceConfig, set_mount: Callable[[Mount], None]
@@ -188,7 +188,7 @@ class SurveyReporter:
                 self._notifier.announce(Severity.INFO, sentence, gcs_text=gcs_text, topic=f"survey {name}")
 
     def _apply_mount(self) -> None:
-        """Level the next pictures by the estimated mount, and discard the comparisons with GPS so far."""
+        """From now on, level pictures with the estimated mount; discard the comparisons with GPS so far."""
         mount = Mount(*(self._reported.get(name, self._expected[name])[0] for name in _MOUNT_NAMES))
         self._survey.set_mount(mount)
         self._gps.reset()
@@ -200,7 +200,7 @@ def _format_result(name: str, measure: SurveyMeasure) -> tuple[str, str]:
     value = measure.value[0]
     if name == "off_m":
         offset = f"{format_offset(*measure.value)} of GPS"
-        return f"the map lies {offset}, +-{measure.sd:.1f} m", f"map {offset}"
+        return f"the map is {offset}, +-{measure.sd:.1f} m", f"map {offset}"
     if name == "scale":
         size = f"{abs(value):.1%} too {'large' if value > 0 else 'small'}"
         return f"the map is {size}, +-{measure.sd:.1%}", f"map is {size}"

@@ -44,13 +44,12 @@ class TechniqueCosts:
 
     `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
     file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than
-    `max_matches` places are compared, only a proportional share of it is paid.
-    `candidates`: number of places compared after all places of the map are scanned in RAM (None: the technique has one
-    stage, and compares all places). `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a
-    query for the scan.
-    `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`).
-    `process_mb`: peak resident memory of the process without a map.
-    `is_network`: images are encoded by a network. `sequence`: number of queries matched together.
+    `max_matches` places are compared, only a proportional share of it is paid. `candidates`: number of places compared
+    after all places of the map are scanned in RAM (None: the technique has one stage, and compares all places).
+    `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a query for the scan.
+    `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`). `process_mb`: peak
+    resident memory of the process without a map. `is_network`: images are encoded by a network. `sequence`: number of
+    queries matched together.
     """
 
     encode: StageCost

@@ -18,7 +18,7 @@ HEIGHT_M = 80.0
 METRES_PER_PIXEL = 0.4
 LIGHT = Light(sun_azimuth_deg=48, sun_elevation_deg=52)
 CAMERA = Camera(noise_sigma=4.0)
-DOWN = Optics(focal_share=0.77, looks_down=True, is_level=False)
+DOWN = Optics(focal=0.77, looks_down=True, is_level=False)
 
 
 def make_ground() -> np.ndarray:

@@ -121,7 +121,7 @@ def test_a_sync_that_fails_between_lines_is_trouble_and_no_exception(path, monke
         with monkeypatch.context() as patch:
             patch.setattr(os, "fdatasync", lambda fd: os.write(os.open("/dev/full", os.O_WRONLY), b"x"))
             log.sync_if_due(clock())
-        assert "No space" in log.state
+        assert "No space" in log.fault
         log.write("third")
     assert kinds(path) == ["first", "second", "gap", "third"]
 
@@ -142,12 +142,12 @@ def test_a_disk_that_has_room_again_is_written_again_without_half_a_line(path, c
         log.write("lost")
         log.write("lost")
         assert path.read_bytes() == whole
-        assert log.state
+        assert log.fault
     log.write("after")
     log.close()
     assert kinds(path) == ["before", "gap", "after"]
     assert next(r for r in read_log(path) if r["kind"] == "gap")["lost_lines"] == 2
-    assert (log.state, log.lost_lines) == (None, 2)
+    assert (log.fault, log.lost_lines) == (None, 2)
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 2
     assert "2 lines" in said[1]
@@ -258,10 +258,10 @@ def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, 
     log = written(path, 100, 100)
     assert numbers(path) == list(range(200))
     assert not list_numbered(path), "no number is left without a file"
-    assert (log.state, log.lost_lines) == (None, 0)
+    assert (log.fault, log.lost_lines) == (None, 0)
     said = (
-        f"The flight log {path} cannot be set aside (Read-only file system), so it is written on, and may grow past "
-        "log.max_mb: let the flight write to its folder."
+        f"The flight log {path} cannot be rotated (Read-only file system), so it grows and may "
+        "exceed log.max_mb: make its folder writable for the flight."
     )
     assert caplog.messages == [said, said], "once a flight"
     assert [line["n"] for line in select_last_flight(path) if line["kind"] == "query"] == list(range(100, 200))
@@ -270,11 +270,11 @@ def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, 
 def test_a_log_that_another_flight_writes_is_refused_and_a_service_waits_for_it(path):
     with FlightLog(path) as first:
         first.write("start", name="a")
-        with pytest.raises(EdgevprError, match="another edgevpr writes it"):
+        with pytest.raises(EdgevprError, match="another edgevpr process writes to it"):
             FlightLog(path)
         second = FlightLog(path, wait=True)
         second.write("query", n=1)
-        assert "another edgevpr" in second.state
+        assert "another edgevpr" in second.fault
         first.write("query", n=0)
     second.write("query", n=2)
     second.close()
@@ -314,10 +314,10 @@ def test_kill_9_at_any_time_loses_no_line_and_no_file(path):
 def test_a_service_waits_for_the_medium_of_its_log(tmp_path, caplog):
     path = tmp_path / "card" / "flight.jsonl"
     log = FlightLog(path, wait=True)
-    assert str(path) in log.state
+    assert str(path) in log.fault
     log.write("query", n=1)
     path.parent.mkdir()  # the card is put back
     log.write("query", n=2)
     log.close()
     assert [(line["kind"], line.get("n")) for line in read_log(path)] == [("gap", None), ("query", 2)]
-    assert log.state is None
+    assert log.fault is None

@@ -14,10 +14,10 @@ from edgevpr.runtime.flight.frozenwatch import Optics
 
 pytestmark = pytest.mark.slow
 
-AHEAD = Optics(focal_share=0.77, looks_down=False, is_level=False)
+AHEAD = Optics(focal=0.77, looks_down=False, is_level=False)
 STAY = Reason(ReasonCode.IMAGES_UNCHANGED)
 MOVE = Reason(ReasonCode.IMAGES_CHANGE_AGAIN)
-GIMBAL = Optics(focal_share=0.77, looks_down=True, is_level=True)
+GIMBAL = Optics(focal=0.77, looks_down=True, is_level=True)
 
 
 @pytest.fixture(scope="module")

@@ -61,7 +61,7 @@ def test_a_file_that_is_missing_is_said_and_the_rest_is_read(path, flown):
     flown[3].unlink()
     whole = select_last_flight(path)
     assert numbers(whole) == [100, 102, 103]
-    assert whole.missing == (f"Files of the flight that are missing before {path}: 1. The flight is read without them.")
+    assert whole.missing == f"Files of this flight before {path} are missing (1): it is read without them."
 
 
 def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown):
@@ -93,5 +93,5 @@ def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(EdgevprError, match="no flight-log lines"):
         select_last_flight(tmp_path / "empty")
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
-        with pytest.raises(UsageError, match="no such"):
+        with pytest.raises(UsageError, match="no flight log"):
             select_last_flight(missing)
