@@ -1,4 +1,4 @@
-"""Decoding of streams and video files with FFmpeg (PyAV), which unlike OpenCV reports lost packets and incomplete
+"""Decodes streams and video files with FFmpeg (PyAV), which unlike OpenCV reports lost packets and incomplete
 images. Imported only when a stream or video file is opened, because the library uses much memory."""
 
 import errno
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
     from edgevpr.frames.webpictures import ResponseFile
 
-# FFmpeg's messages are searched for reports of lost packets and then dropped: edgevpr reports faults in its own words.
+# FFmpeg's messages are searched for reports of lost packets, then discarded: edgevpr reports faults in its own words.
 av.logging.set_level(av.logging.WARNING)
 av.logging.set_skip_repeated(False)
 logging.getLogger("libav").setLevel(logging.CRITICAL + 1)
 _LOSS_WORD = "missed"  # "RTP: missed 3 packets" is the only sign of packet loss
 
 _DOUBTFUL_PACKETS = 2  # after a sign of packet loss: this packet and the next
-_NO_STAMPS_FLAG = 0x80  # AVFMT_NOTIMESTAMPS: FFmpeg derives the time stamps from a frame rate
+_NO_STAMPS_FLAG = 0x80  # AVFMT_NOTIMESTAMPS: FFmpeg derives the timestamps from a frame rate
 
 _UNKNOWN_HOST_PATTERN = re.compile(r"(?:resolve hostname |getaddrinfo\()([^\s:,]+)")
 _STATUS_PATTERN = re.compile(r"(?:failed:|HTTP error|returned) ([45]\d\d)\b")  # of RTSP and of HTTP
@@ -64,15 +64,16 @@ def open_decoder(
     uri: str,
     options: dict[str, str],
     timeouts_s: tuple[float, float] | None = None,
-    form: str | None = None,
+    format_name: str | None = None,
     file: "ResponseFile | None" = None,
 ) -> "VideoDecoder":
     """Open the stream or file `uri` with FFmpeg's `options`. `timeouts_s`: time limits in seconds for opening it and
-    for each read (None: no limits). `form`: name of its format (None: FFmpeg detects it). `file`: an open file to read
-    instead, which the decoder closes. Raises OpeningError with the cause if it cannot be opened or has no video."""
+    for each read (None: no limits). `format_name`: name of its format (None: FFmpeg detects it). `file`: an open file
+    to read instead, which the decoder closes. Raises OpeningError with the cause if it cannot be opened or has no
+    video."""
     with av.logging.Capture() as logged:
         try:
-            container = av.open(file or uri, "r", format=form, options=options, timeout=timeouts_s)
+            container = av.open(file or uri, "r", format=format_name, options=options, timeout=timeouts_s)
         except (av.FFmpegError, OSError, ValueError) as error:
             messages = [message for _, _, message in logged]
             if file:
@@ -92,8 +93,8 @@ def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
 
 
 def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
-    """Return the error that explains why FFmpeg could not open `uri` in `timeout_s` seconds. Some causes appear only in
-    the `messages` that FFmpeg logged. The text never contains the address, which may contain a password."""
+    """Return the error that explains why FFmpeg could not open `uri` within `timeout_s` seconds. Some causes appear
+    only in the `messages` that FFmpeg logged. The text never contains the address, which may contain a password."""
     text = "\n".join(messages)
     if "SETUP failed: 461" in text or "Nonmatching transport" in text:
         return TransportError("transport refused (461)")
@@ -103,20 +104,20 @@ def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s:
 def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
     if host := _UNKNOWN_HOST_PATTERN.search(text):
         if uri.count("@") > 1:  # the host may be part of the password
-            return "no such host: percent-encode the password's special characters, such as @ as %40"
+            return "no such host: percent-encode special characters in the password, such as @ as %40"
         return f"no such host {host[1]}"
     if isinstance(error, (av.HTTPClientError, av.HTTPServerError)):
         code = _STATUS_PATTERN.search(f"{text}\n{error}")
         status = code[1] if code else "HTTP"
         if status == "401":
             if "@" not in urlsplit(uri).netloc:
-                return "password needed (401): write USER:PASSWORD@ before the host"
-            return "password refused (401): correct it, with special characters percent-encoded, such as % as %25"
+                return "password needed (401): add USER:PASSWORD@ before the host"
+            return "password refused (401): correct it, and percent-encode special characters, such as % as %25"
         return _STATUS_CAUSES.get(status, f"refused by the camera ({status})")
-    number = errno.EADDRINUSE if "Address already in use" in text else getattr(error, "errno", 0)
-    if number in _ERRNO_CAUSES:
-        return _ERRNO_CAUSES[number]
-    if isinstance(error, av.ExitError) or "Immediate exit" in text or number == errno.ETIMEDOUT:
+    error_number = errno.EADDRINUSE if "Address already in use" in text else getattr(error, "errno", 0)
+    if error_number in _ERRNO_CAUSES:
+        return _ERRNO_CAUSES[error_number]
+    if isinstance(error, av.ExitError) or "Immediate exit" in text or error_number == errno.ETIMEDOUT:
         missing = "video in the packets" if uri.lower().startswith(("udp:", "rtp:")) else "answer"
         return f"no {missing} within {timeout_s:g} s"
     if isinstance(error, av.InvalidDataError):
@@ -128,7 +129,7 @@ class VideoDecoder:
     """Decodes the complete images of one stream or file: `fetch` a packet, then `decode` it. A damaged image is
     rejected, and so are all later ones until the next key frame, which depends on no other image.
 
-    `is_cancelled`: set it to True to end a `fetch` in another thread at the next packet, even an audio packet.
+    `is_cancelled`: set this to True to end a `fetch` in another thread at the next packet, even an audio packet.
     `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead during the opening, but not which ones. All
     packets are rejected until this is set to False."""
 
@@ -136,16 +137,16 @@ class VideoDecoder:
         self, container: "InputContainer", is_backlog_doubtful: bool, file: "ResponseFile | None" = None
     ) -> None:
         self.container, self.stream, self._file = container, container.streams.video[0], file
-        self.unit_s = float(self.stream.time_base or 1e-6)  # of the time stamps
+        self.unit_s = float(self.stream.time_base or 1e-6)  # of the timestamps
         self.is_stamped = not container.format.flags & _NO_STAMPS_FLAG
         self.is_backlog_doubtful = is_backlog_doubtful
         self.is_cancelled = False
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # parallel decoding delays images and uses memory
-        self._codec.options = {"err_detect": "explode"}  # damaged data is an error and not concealed
+        self._codec.options = {"err_detect": "explode"}  # report damaged data as an error instead of concealing it
         self._packets = container.demux()
         self._converter = PixelConverter()
-        self._doubtful = 0  # number of the next packets that are doubtful, if above zero
+        self._doubtful_count = 0  # if above zero, this many of the next packets are doubtful
         self._refusal: Refusal | None = Refusal.LATE  # reason to reject all images until the next key frame
         self._has_begun = False
 
@@ -174,9 +175,9 @@ class VideoDecoder:
             return None
         if packet.is_corrupt or _has_loss(logged):
             # FFmpeg reports a gap while it assembles the image that follows the one it returns.
-            self._doubtful = _DOUBTFUL_PACKETS
-        self._doubtful -= 1
-        return TimedPacket(packet, self._doubtful >= 0)
+            self._doubtful_count = _DOUBTFUL_PACKETS
+        self._doubtful_count -= 1
+        return TimedPacket(packet, self._doubtful_count >= 0)
 
     def skip(self) -> Refusal:
         """Reject the packet just fetched without decoding it, and all later ones until the next key frame. Returns the

@@ -14,14 +14,14 @@ Counts: TypeAlias = NDArray[np.uint16]
 Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
 
 _RANGE_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots lie outside
-_MIN_SPAN_COUNTS = 64  # so that an image of mere sensor noise stays flat
-_TIME_CONSTANT_PICTURES = 30  # long enough that a passing object does not change the other grey levels
-_MAX_CLIPPED_SHARE = 0.25  # of an image; if more is outside the range, the camera or the scene has changed
-_MIN_USED_SHARE = 0.25  # of the range; an image that used less would have too little contrast
+_MIN_SPAN_COUNTS = 64  # so that an image of pure sensor noise stays flat
+_TIME_CONSTANT_PICTURES = 30  # so slow that a passing object does not change the grey levels around it
+_MAX_CLIPPED_FRACTION = 0.25  # of an image; if more is outside the range, the camera or the scene has changed
+_MIN_USED_FRACTION = 0.25  # of the range; an image that used less would have too little contrast
 
 
 class DepthRange:
-    """The range of counts of one source. It adapts slowly to the images, in the order in which they are passed."""
+    """The range of counts of one source. It adapts slowly to the images, which must be passed in order."""
 
     def __init__(self) -> None:
         self._low = 0.0
@@ -32,16 +32,16 @@ class DepthRange:
         that does not fit the range, sets the range to its own."""
         sample = make_thumbnail(counts)
         low, high = _find_limits(sample)
-        clipped_share = float(((sample < self._low) | (sample > self._high)).mean())
-        has_contrast = high - low >= _MIN_USED_SHARE * (self._high - self._low)
-        is_known = self._high > 0 and has_contrast and clipped_share <= _MAX_CLIPPED_SHARE
-        gain = 1 / _TIME_CONSTANT_PICTURES if is_known else 1.0
+        clipped_fraction = float(((sample < self._low) | (sample > self._high)).mean())
+        has_contrast = high - low >= _MIN_USED_FRACTION * (self._high - self._low)
+        fits_range = self._high > 0 and has_contrast and clipped_fraction <= _MAX_CLIPPED_FRACTION
+        gain = 1 / _TIME_CONSTANT_PICTURES if fits_range else 1.0
         self._low += gain * (low - self._low)
         self._high += gain * (high - self._high)
         return round(self._low), round(self._high)
 
     def to_8_bits(self, counts: Counts) -> Image:
-        """Return the image in grey levels, uint8 of the same shape, after updating the range with its counts."""
+        """Update the range with the image, and return the image in grey levels, uint8 of the same shape."""
         return to_8_bits(counts, self.update(counts))
 
 

@@ -19,8 +19,8 @@ _ERRNO_CAUSES = {
     errno.ENXIO: "no driver for this device",
     errno.ENODEV: "no driver for this device",
     errno.EBUSY: "in use by another program",
-    errno.EACCES: "not permitted for this user",
-    errno.EPERM: "not permitted for this user",
+    errno.EACCES: "this user may not access it",
+    errno.EPERM: "this user may not access it",
 }
 _QUERY_CAPABILITIES = 0x80685600  # VIDIOC_QUERYCAP
 _CAPABILITIES_BYTES = 104
@@ -65,7 +65,7 @@ class DeviceCapture:
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # otherwise OpenCV keeps only the upper 8 bits
 
     def read(self) -> Shot | None:
-        with contextlib.suppress(cv2.error):  # an image that cannot be converted counts as a lost source
+        with contextlib.suppress(cv2.error):  # if an image cannot be converted, the source counts as lost
             request_s = self._clock()
             is_read, picture = self._capture.read()
             if is_read:
@@ -85,7 +85,7 @@ class DeviceCapture:
         return make_thumbnail(image if image.ndim == 2 else image[:, :, 1]), lambda: image
 
     def cancel(self) -> None:
-        """Do nothing: OpenCV's wait for an image cannot be interrupted, and lasts ten seconds at most."""
+        """Do nothing: OpenCV's wait for an image cannot be interrupted, but times out (see `frames.images`)."""
 
     def release(self) -> None:
         self._capture.release()

@@ -14,12 +14,12 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import ALT_LIMITS_M, GeoTag, make_position, parse_time
 
 T = TypeVar("T")
-Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSLatitude"
+Tags = Mapping[str, Any]  # values from exifread by tag name, such as "GPS GPSLatitude"
 
 _FILM_DIAGONAL_MM = 43.27
-_MAX_SIDE_SHARE = 0.82  # of the diagonal
+_MAX_SIDE_FRACTION = 0.82  # of the diagonal
 _HEAD_BYTES = 300_000  # in a JPEG the XMP comes before the image, after at most 64 KB of EXIF data
-# An XMP value, as an attribute or an element, by DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
+# An XMP value, as an attribute or an element, of DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
 _XMP_PATTERN = re.compile(
     rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]"""
 )
@@ -60,16 +60,16 @@ def read_fov_deg(path: str | Path) -> float | None:
         tags = _read_tags(path)
         focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
-        # Images wider than 4:3 and 3:2 are cropped from the sensor's at full width.
-        longest = min(max(sides) / math.hypot(*sides), _MAX_SIDE_SHARE)
-        return _require_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
+        # Images wider than 3:2 are crops of the full-width sensor image.
+        side_fraction = min(max(sides) / math.hypot(*sides), _MAX_SIDE_FRACTION)
+        return _require_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * side_fraction / 2 / focal_mm)), 5, 150)
     return None
 
 
 def _read_tags(path: str | Path) -> Tags:
     import exifread  # not at the top: most sources never need it
 
-    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it would report every file without EXIF
+    logging.getLogger("exifread").setLevel(logging.CRITICAL)  # by default it warns about every file without EXIF
     with contextlib.suppress(Exception), open(path, "rb") as handle:  # malformed files can raise anything
         tags: Tags = exifread.process_file(handle, details=False)
         return tags
@@ -78,7 +78,7 @@ def _read_tags(path: str | Path) -> Tags:
 
 def _require_range(value: float, low: float, high: float) -> float:
     if not low <= value <= high:
-        raise ValueError(f"{value:g} where {low:g} to {high:g} is possible")
+        raise ValueError(f"{value:g} is not between {low:g} and {high:g}")
     return value
 
 
@@ -106,7 +106,7 @@ def _read_alt_m(tags: Tags) -> float:
 
 def _read_heading_deg(tags: Tags) -> float | None:
     if "GPS GPSImgDirectionRef" in tags and tags["GPS GPSImgDirectionRef"].values != "T":
-        return None  # magnetic: wrong by the declination, which is unknown
+        return None  # magnetic north: off by the declination, which is unknown
     return _require_range(float(tags["GPS GPSImgDirection"].values[0]), 0, 360) % 360
 
 
@@ -127,15 +127,15 @@ def _read_camera_time_s(tags: Tags) -> float:
 
 
 def _parse_time_s(text: str) -> float:
-    if ":" not in text:  # a number of seconds, which is not an EXIF time
+    if ":" not in text:  # a plain number of seconds is not an EXIF time
         raise ValueError(text)
     return parse_time(text)
 
 
 def read_xmp(path: str | Path) -> GeoTag:
     """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
-    that is absent, damaged or impossible is None. The heading is that of the image's top or, if unknown, of the
-    aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is above the take-off
+    that is absent, damaged or impossible is None. The heading is the direction of the image's top or, if unknown, of
+    the aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is above the take-off
     point."""
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
@@ -158,7 +158,7 @@ def read_xmp(path: str | Path) -> GeoTag:
 
 
 def _find_values(packet: bytes) -> dict[str, bytes]:
-    return {name.decode(): text for name, text in reversed(_XMP_PATTERN.findall(packet))}  # the first of a name wins
+    return {name.decode(): text for name, text in reversed(_XMP_PATTERN.findall(packet))}  # first one wins
 
 
 def _find_angles(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
@@ -186,7 +186,7 @@ def to_nadir_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[
     # The result is the attitude of an imaginary airframe whose nose points to the image's top and whose down axis is
     # the viewing direction. If the camera looks straight down, the gimbal's roll only rotates the image.
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
-    # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, for which atan2 is off by 180 degrees.
+    # The nose before applying the yaw. Adding or subtracting 0.0 avoids -0.0, for which atan2 is off by 180 degrees.
     forward, right = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)
     north, east = forward * math.cos(yaw) - right * math.sin(yaw), forward * math.sin(yaw) + right * math.cos(yaw)
     return (

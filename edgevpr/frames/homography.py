@@ -15,10 +15,10 @@ class Homography:
 
     def __init__(self, out_from_pixel: Doubles, corners: Doubles, side: int, shrink: float) -> None:
         self._out_from_pixel, self._side, self._shrink = out_from_pixel, side, shrink
-        ends = out_from_pixel @ corners
-        points = np.round((ends[:2] / ends[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
-        shown = cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS)
-        self.shown: Mask = shown.view(np.bool_)
+        warped = out_from_pixel @ corners
+        points = np.round((warped[:2] / warped[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
+        visible = cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS)
+        self.visible: Mask = visible.view(np.bool_)
 
     def warp_mask(self, overlay: Mask) -> Mask:
         size = (self._side, self._side)
@@ -42,8 +42,8 @@ def clip_polygon(corners: Doubles, depth: Doubles) -> Doubles:
     points = []
     for previous, current in zip(range(-1, len(depth) - 1), range(len(depth)), strict=True):
         if (depth[previous] > 0) != (depth[current] > 0):
-            share = depth[previous] / (depth[previous] - depth[current])
-            points.append(corners[:, previous] + share * (corners[:, current] - corners[:, previous]))
+            fraction = depth[previous] / (depth[previous] - depth[current])
+            points.append(corners[:, previous] + fraction * (corners[:, current] - corners[:, previous]))
         if depth[current] > 0:
             points.append(corners[:, current])
     return np.column_stack(points)

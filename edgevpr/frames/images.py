@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2 as cv2  # other packages import it from here
+import cv2 as cv2  # re-exported: other packages import it from here
 import numpy as np
 
 from edgevpr.core.arrays import Image
@@ -36,34 +36,34 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 _START_PATTERN = re.compile(
     rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s"
 )  # JPEG, PNG, TIFF (2), BMP, WebP, PNM
-# In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
+# In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) is not an end marker.
 _MARKER_PATTERN = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 _END_OF_IMAGE = 0xD9
 
 
 def list_images(folder: str | Path) -> list[Path]:
-    """List the paths of the images directly in `folder`, sorted by name, with numbers in counting order (2 before 10).
+    """List the paths of the images directly in `folder`, sorted by name, with numbers in numeric order (2 before 10).
     Raises SourceError if the folder cannot be read or contains no images."""
     folder = Path(folder)
     try:
         names = sorted((path.name for path in folder.iterdir()), key=make_sort_key)
     except OSError as error:
-        raise SourceError(f"{folder} cannot be read ({error.strerror}): give a folder of images.") from None
+        raise SourceError(f"{folder} cannot be read ({error.strerror}): choose a readable folder of images.") from None
     if images := [folder / name for name in names if is_image(name)]:
         return images
-    inner = [str(folder / name) for name in names if any(is_image(path.name) for path in (folder / name).glob("*"))]
-    advice = " or ".join(inner[:3]) or "one that does"
-    raise SourceError(f"The folder {folder} contains no images ({' '.join(EXTENSIONS)}): give {advice}.")
+    nested = [str(folder / name) for name in names if any(is_image(path.name) for path in (folder / name).glob("*"))]
+    advice = " or ".join(nested[:3]) or "one that does"
+    raise SourceError(f"The folder {folder} contains no images ({' '.join(EXTENSIONS)}): choose {advice}.")
 
 
 def is_image(name: str) -> bool:
     """Return True if the file name is that of an image."""
-    # Names that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
+    # Files whose names begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
     return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
 
 
 def make_sort_key(name: str) -> tuple[list[str | int], str]:
-    """Return the sort key of a file name; numbers within names sort in counting order (2 before 10)."""
+    """Return the sort key of a file name; numbers within names sort in numeric order (2 before 10)."""
     parts = re.split(r"(\d+)", name.lower())
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
@@ -75,9 +75,9 @@ def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
-        raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
+        raise ImageError(f"The image {path} cannot be read ({error.strerror}): make the file readable.") from error
     except MemoryError:
-        raise ImageError(f"{path} does not fit in the free memory: give a smaller image.") from None
+        raise ImageError(f"{path} does not fit in the free memory: use a smaller image.") from None
     return decode_image(data, str(path), depth)
 
 
@@ -86,19 +86,19 @@ def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Ima
     if _is_incomplete(data):
         raise ImageError(f"{path} is empty, truncated or damaged: copy it again from the camera.")
     image = None
-    with contextlib.suppress(cv2.error):  # raised for too many pixels
+    with contextlib.suppress(cv2.error):  # raised if there are too many pixels
         if _START_PATTERN.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     # OpenCV has a different limit if a program imported it before edgevpr, so the size is checked here too.
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ImageError(
-            f"{path} is not an image that edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file with 8 or 16 "
+            f"{path} is not an image that edgevpr can decode: use a JPEG, PNG, TIFF, BMP or WebP file with 8 or 16 "
             f"bits per channel and at most {MAX_PIXELS / 1e6:.0f} megapixels."
         )
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE_PX:
         raise ImageError(
-            f"{path} is {width}x{height} pixels; at least {MIN_SIDE_PX}x{MIN_SIDE_PX} are needed: give a larger image."
+            f"{path} is {width}x{height} pixels, but must be at least {MIN_SIDE_PX}x{MIN_SIDE_PX}: use a larger image."
         )
     if image.dtype == np.uint16:
         return (depth or DepthRange()).to_8_bits(image.astype(np.uint16, copy=False))
@@ -111,7 +111,7 @@ def decode_jpeg(jpeg: bytes) -> Image:
 
 
 def encode_jpeg(image: Image) -> bytes:
-    """Encode an image, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in flight recordings."""
+    """Encode an image, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG in the quality of flight recordings."""
     return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _RECORDING_QUALITY))
 
 
@@ -139,8 +139,8 @@ def resize(image: Image, size_px: tuple[int, int]) -> Image:
 
 
 def shrink_image(image: Image, shrink: float) -> Image:
-    """Downscale an image by the factor `shrink` before a warp, whose interpolation alone would skip most pixels. Up to
-    a factor of 2, the image is returned unchanged."""
+    """Downscale an image by the factor `shrink` before a warp, because interpolation alone would skip most pixels. Up
+    to a factor of 2, the image is returned unchanged."""
     if shrink <= 2:
         return image
     height, width = image.shape[:2]

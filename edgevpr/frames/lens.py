@@ -21,26 +21,26 @@ from edgevpr.core.files import read_file
 from edgevpr.core.yamlfile import parse_yaml
 from edgevpr.frames.images import shrink_image
 
-_MAX_FILE_BYTES = 300_000  # OpenCV's program also writes all chessboard corners to its file
+_MAX_FILE_BYTES = 300_000  # OpenCV's calibration program also writes all chessboard corners to its file
 # These parts of OpenCV's files are not YAML. OpenCV's own reader is not used because it crashes on damaged files.
 _OPENCV_TAGS = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
-_COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)  # that OpenCV supports, beginning with k1 k2 p1 p2; fisheye: only 4
+_COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)  # supported by OpenCV, beginning with k1 k2 p1 p2; fisheye: only 4
 _FISHEYE = "equidistant"
 _NO_DISTORTION = "none"
 # Names of models in ROS and Kalibr files; "" stands for an OpenCV file.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
-_MAX_UNDISTORTED_FOV_DEG = 100.0  # of an undistorted image: beyond, its corners would waste many pixels
+_MAX_UNDISTORTED_FOV_DEG = 100.0  # of an undistorted image: in a wider one, the corners would waste many pixels
 _MAX_SKEW = 0.002  # relative to the focal length; ignored because it shifts points by less than a pixel
 _MIN_FOV_DEG = 5.0  # as of `source.fov_deg`
-_MAX_OFF_AXIS_DEG = 85.0  # up to which a lens is sampled, from its axis
+_MAX_OFF_AXIS_DEG = 85.0  # from the optical axis, up to which a lens is sampled
 _OFF_AXIS_STEP_DEG = 0.25
-_DIRECTIONS_DEG = range(0, 360, 15)
+_DIRECTIONS_DEG = range(0, 360, 15)  # clockwise from right
 _RIGHT = _DIRECTIONS_DEG.index(0)
 _DOWN = _DIRECTIONS_DEG.index(90)
 _LEFT = _DIRECTIONS_DEG.index(180)
 _UP = _DIRECTIONS_DEG.index(270)
 _CELL_PX = 8  # the warp is computed at every eighth pixel and interpolated; the error is below 0.1 pixels
-_OUTSIDE_PX = -1e6  # far enough outside that values interpolated with it are also outside
+_OUTSIDE_PX = -1e6  # so far outside that values interpolated with it are also outside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,17 +126,17 @@ class LensView:
         pixel_from_node = np.array([[_CELL_PX, 0, 0], [0, _CELL_PX, 0]], float)
         pixels = np.asarray(cv2.warpAffine(nodes.astype(np.float32), pixel_from_node, size_px), np.float32)
         lower_right = np.array([side - 0.5 for side in self.lens.size_px])
-        shown = cv2.inRange(pixels, np.array([-0.5, -0.5]), lower_right).astype(bool)
-        return Remap(pixels, shown, max(self.lens.focal_px) / out_px)
+        visible = cv2.inRange(pixels, np.array([-0.5, -0.5]), lower_right).astype(bool)
+        return Remap(pixels, visible, max(self.lens.focal_px) / out_px)
 
 
 @dataclass(frozen=True, slots=True)
 class Remap:
-    """A warp of a camera's image to (H, W). `pixels` (H, W, 2): source coordinates of each output pixel. `shown` (H,
+    """A warp of a camera's image to (H, W). `pixels` (H, W, 2): source coordinates of each output pixel. `visible` (H,
     W): False where they lie outside the camera's image. `shrink`: source pixels per output pixel, along a side."""
 
     pixels: Singles
-    shown: Mask
+    visible: Mask
     shrink: float
 
     def warp_mask(self, overlay: Mask) -> Mask:
@@ -147,14 +147,14 @@ class Remap:
         """Warp the camera's image. Outside it, its edge is replicated, so that no false gradient arises."""
         shrunk, pixels = shrink_image(image, self.shrink), self.pixels
         if shrunk is not image:
-            pixels = pixels + np.float32(0.5)  # the only copy: boards have little memory
+            pixels = pixels + np.float32(0.5)  # makes the only copy: boards have little memory
             pixels *= np.array([shrunk.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
             pixels -= np.float32(0.5)
         return _remap_image(shrunk, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
 def _remap_image(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
-    # None: the first of the two maps has both coordinates. OpenCV's type stubs demand a second one.
+    # None: the first map holds both coordinates. OpenCV's type stubs demand a second one.
     return cv2.remap(image, pixels, None, interpolation, borderMode=border)  # type: ignore
 
 
@@ -164,9 +164,9 @@ def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensVie
     differs from that of the calibration, and ConfigError for an impossible calibration."""
     (width, height), (lens_width, lens_height), (column, row) = size_px, lens.size_px, lens.centre_px
     if not np.isfinite([*lens.focal_px, column, row, *lens.coefficients]).all():
-        raise lens.make_error("a value is not a number")
+        raise lens.make_error("a value is not a finite number")
     if min(lens.focal_px) <= 0:
-        raise lens.make_error("a focal length is not above zero")
+        raise lens.make_error("a focal length is not positive")
     if not (0 < column < lens_width and 0 < row < lens_height):
         raise lens.make_error("its principal point lies outside the picture")
     if abs(height - width * lens_height / lens_width) > 1 and abs(width - height * lens_width / lens_height) > 1:
@@ -181,20 +181,20 @@ def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensVie
     with np.errstate(all="ignore"):
         offset_px = lens.project(rays.reshape(-1, 2)).reshape(rays.shape) - lens.centre_px
         grows = np.diff(np.hypot(offset_px[..., 0], offset_px[..., 1]), axis=1) > 0  # False for NaN as well
-    steady = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # steps over which each ray's pixel moves outwards
+    valid_steps = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # over which each ray's pixel moves outwards
 
     def find_edge(direction: int, axis: int, edge_px: float) -> float:
-        """Return the tangent of the ray that meets the edge of the image in a direction."""
-        steps = slice(steady[direction] + 1)
+        """Return the tangent of the ray in a direction that meets the edge of the image."""
+        steps = slice(valid_steps[direction] + 1)
         distances_px, edge_distance_px = np.abs(offset_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
-        if distances_px[-1] < edge_distance_px and steady[direction] < len(tangents) - 1:
+        if distances_px[-1] < edge_distance_px and valid_steps[direction] < len(tangents) - 1:
             raise lens.make_error("its distortion is not invertible up to the edge of the picture")
         return float(np.interp(edge_distance_px, distances_px, tangents[steps]))
 
     right, left = find_edge(_RIGHT, 0, width - 0.5), find_edge(_LEFT, 0, -0.5)
     lower, upper = find_edge(_DOWN, 1, height - 0.5), find_edge(_UP, 1, -0.5)
     widest = math.tan(math.radians(_MAX_UNDISTORTED_FOV_DEG / 2))
-    half, max_ray = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
+    half, max_ray = (min(right, left, widest), min(lower, upper, widest)), float(tangents[valid_steps.min()])
     full_fov_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
     if math.hypot(*half) > max_ray:
         raise lens.make_error("its distortion is not invertible up to the corners of the picture")
@@ -209,14 +209,14 @@ def read_lens(path: str) -> CalibratedLens:
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error.strerror}): give a camera calibration.") from error
+        raise ConfigError(f"{path} cannot be read ({error.strerror}): choose a readable calibration file.") from error
     content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parse_yaml(_OPENCV_TAGS.sub(b"", data), path)
     fields = {str(name).lower(): value for name, value in content.items()}  # old OpenCV files use capitals
     try:
         lens = _read_kalibr(fields["cam0"], path) if "cam0" in fields else _read_matrix(fields, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         fault = f"lacks `{error.args[0]}`" if isinstance(error, KeyError) else "is incomplete"
-        advice = "give a calibration file of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)"
+        advice = "use a calibration file of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)"
         raise ConfigError(f"{path} {fault}: {advice}.") from error
     compute_lens_view(lens, lens.size_px)
     return lens
@@ -226,9 +226,9 @@ def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
     """Make the lens from the fields of an OpenCV or ROS file, which have the same names."""
     matrix, coefficients = _read_numbers(fields["camera_matrix"]), _read_numbers(fields["distortion_coefficients"])
     if len(matrix) != 9:
-        raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers but needs 9.")
+        raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, but must have 9.")
     if abs(matrix[1]) > _MAX_SKEW * abs(matrix[0]):
-        raise ConfigError(f"{path} has skew (second number of `camera_matrix`): calibrate without skew.")
+        raise ConfigError(f"{path} has skew (second number of `camera_matrix`): calibrate the camera without skew.")
     model = fields.get("distortion_model", _FISHEYE if int(fields.get("fisheye_model") or 0) else "")
     size_px = int(fields["image_width"]), int(fields["image_height"])
     return _make_lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)
@@ -236,25 +236,25 @@ def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
 
 def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
     if (model := camera["camera_model"]) != "pinhole":
-        raise ConfigError(f"{path} has the camera model `{model}`: calibrate with the model `pinhole`.")
+        raise ConfigError(f"{path} has the camera model `{model}`: calibrate the camera with the model `pinhole`.")
     coefficients = _read_numbers(camera.get("distortion_coeffs") or ())
     width, height = map(int, camera["resolution"])
-    pinhole = _read_numbers(camera["intrinsics"])
-    return _make_lens(path, pinhole, camera["distortion_model"], coefficients, (width, height))
+    intrinsics = _read_numbers(camera["intrinsics"])
+    return _make_lens(path, intrinsics, camera["distortion_model"], coefficients, (width, height))
 
 
 def _make_lens(
-    path: str, pinhole: tuple[float, ...], model: str, coefficients: tuple[float, ...], size_px: tuple[int, int]
+    path: str, intrinsics: tuple[float, ...], model: str, coefficients: tuple[float, ...], size_px: tuple[int, int]
 ) -> CalibratedLens:
-    """Make a lens. `model`: its distortion model. `pinhole`: focal lengths and principal point. Raises ConfigError for
-    an unknown model."""
-    focal_x, focal_y, column, row = pinhole
+    """Make a lens. `model`: its distortion model. `intrinsics`: focal lengths and principal point. Raises ConfigError
+    for an unknown model."""
+    focal_x, focal_y, column, row = intrinsics
     if model not in _MODELS:
-        raise ConfigError(f"{path} has the distortion model `{model}`: calibrate with {', '.join(_MODELS[1:])}.")
+        raise ConfigError(f"{path} has the distortion model `{model}`: calibrate with one of {', '.join(_MODELS[1:])}.")
     if model == _NO_DISTORTION or not coefficients:
         model, coefficients = "", (0.0,) * 4
     if len(coefficients) not in (_COEFFICIENT_COUNTS[:1] if model == _FISHEYE else _COEFFICIENT_COUNTS):
-        raise ConfigError(f"{path} has {len(coefficients)} coefficients, which no supported distortion model has.")
+        raise ConfigError(f"{path} has {len(coefficients)} coefficients, which matches no supported distortion model.")
     return CalibratedLens(
         path=path,
         focal_px=(focal_x, focal_y),
@@ -271,11 +271,11 @@ def _read_numbers(value: Any) -> tuple[float, ...]:
 
 
 def _read_xml(data: bytes, path: str) -> dict[str, Any]:
-    """Read the fields of an OpenCV XML file, with matrices in the form that ROS files have."""
+    """Read the fields of an OpenCV XML file; matrices are returned in the form used in ROS files."""
     from xml.etree import ElementTree  # rarely needed
 
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError) as error:
-        raise ConfigError(f"{path} is not valid XML ({error}): give the calibration as OpenCV wrote it.") from error
+        raise ConfigError(f"{path} is not valid XML ({error}): use the unmodified file that OpenCV wrote.") from error
     return {node.tag: {"data": (node.findtext("data") or "").split()} if len(node) else node.text for node in root}

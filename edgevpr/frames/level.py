@@ -18,12 +18,12 @@ from edgevpr.frames.homography import Homography, clip_polygon
 from edgevpr.frames.lens import CalibratedLens, Remap, compute_lens_view
 
 MAX_TILT_DEG = 63.0  # for a camera mounted 60 degrees forward that sways
-# Without a known lens an image is not levelled, and beyond this tilt it differs too much from one taken straight down.
-# With a lens, the nadir is near the edge of the image or outside it, and the middle is used in its place.
+# If its lens is unknown, an image is not levelled, and beyond this tilt differs too much from one taken straight down.
+# If it is known, the nadir of such an image is near its edge or outside it, and the middle is used instead.
 MAX_TILT_UNLEVELLED_DEG = 20.0
 # Rays, (right, down, 1) in focal lengths, with a smaller down component are ignored: they show distant ground or sky.
 _MIN_RAY_DOWN = 0.1
-# Standard deviations of the tilt, as tangents: of a reported tilt, and of one known only from the camera's mount.
+# Standard deviations of a reported tilt, and of one known only from the camera's mount; both as tangents.
 _REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
 # Smaller corrections do not affect matches.
@@ -31,16 +31,16 @@ _MIN_TILT_DEG = 1.0
 _MIN_TURN_DEG = 1.0
 _MIN_ZOOM_CHANGE = 0.03
 # Ratio of an image's footprint to the requested one. Beyond these limits too few of its pixels are used, or too little
-# of the output is filled, and the height is more likely wrong than really so different from the map's.
+# of the output is filled, and a wrong height is a likelier cause than a real difference from the map's height.
 _ZOOM_LIMITS = (0.3, 4.0)
-_MIN_FILLED_SHARE = 1 / 3  # of the output area that the image would fill if it were taken straight down
+_MIN_FILLED_FRACTION = 1 / 3  # of the output area that an image taken straight down would fill
 _MAX_HEIGHT_M = 10_000.0
 _MAX_SIDE_PX = 1024  # longest side of a warped image: no technique uses more pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Fixed angles of the camera forward and to the right of straight down, relative to the airframe or gimbal
+    """Fixed angles of the camera from straight down, forward and to the right, relative to the airframe or gimbal
     (negative: backward, to the left)."""
 
     ahead_deg: float = 0.0
@@ -71,12 +71,12 @@ class View:
     """Direction, size and offset of an image on the ground (None: unknown).
 
     `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
-    `nadir_offset`: from the image's middle to the nadir, the point below the camera, (right, up) in shares of the
-    longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt (see `relief`
-    for that of the height). `zoom`: factor by which the image was enlarged; its longest side shows that many times
-    less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for an image that was not warped
-    because its lens is unknown. `focal`: focal length in shares of the longest side. `rotation_deg`: clockwise rotation
-    that was applied to the image.
+    `nadir_offset`: from the image's middle to the nadir, the point straight below the camera, (right, up) as fractions
+    of the longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt (see
+    `relief` for that due to its height). `zoom`: factor by which the image was enlarged: its longest side shows that
+    many times less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for an image that was not
+    warped because its lens is unknown. `focal`: focal length as a fraction of the longest side. `rotation_deg`:
+    clockwise rotation that was applied to the image.
     `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None
@@ -91,7 +91,7 @@ class View:
 
     @property
     def is_georeferenced(self) -> bool:
-        """True if the image's direction and size and the nadir offset are known."""
+        """True if the image's direction, its size and the nadir offset are known."""
         return None not in (self.up_deg, self.footprint_m, self.nadir_offset)
 
     @property
@@ -104,7 +104,7 @@ class View:
         return {
             "up_deg": self.up_deg and round(self.up_deg, 1),
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
-            "nadir_offset": self.nadir_offset and [round(share, 4) for share in self.nadir_offset],
+            "nadir_offset": self.nadir_offset and [round(fraction, 4) for fraction in self.nadir_offset],
             "nadir_offset_m": self.nadir_offset_m and [round(offset_m, 2) for offset_m in self.nadir_offset_m],
             "reason": self.reason and self.reason.fields(),
         }
@@ -133,10 +133,10 @@ def level_image(
     below: bool = False,
     scale: float = 1.0,
 ) -> LevelledImage:
-    """Warp an image as if it had been taken from straight above. Roll, pitch, heading and height are those of the
-    frame or, if unknown there, of `vehicle` (None: no report).
+    """Warp an image as if it had been taken from straight above. Roll, pitch, heading and height are from the frame or,
+    if unknown there, from `vehicle` (None: no report).
 
-    The warp removes roll and pitch (unknown: taken as 0), rotates the image north-up (unless the heading is unknown)
+    The warp removes roll and pitch (assumed 0 if unknown), rotates the image north-up (unless the heading is unknown)
     and scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). `scale`: ratio
     of the ground that the image really shows to that computed from its height. The middle shows the same point as
     before or, with `below`, the nadir. `overlay`, bool (H, W), is False where the image shows no ground (None:
@@ -151,7 +151,7 @@ def level_image(
         view = View(up_deg=camera.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     if below and camera.tilt_deg > MAX_TILT_UNLEVELLED_DEG and camera.heading_deg is None:
-        # The image shows ground far from the aircraft, in a direction that only a match can reveal.
+        # The image shows ground far from the aircraft, and only a match can reveal in which direction.
         view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     image_m = camera.footprint_m and scale * camera.footprint_m
@@ -175,7 +175,7 @@ def level_image(
     warp = camera.warp(out_from_ray, out_px, side)
 
     width, height = (min(1.0, zoom * px / camera.longest_px) for px in camera.size_px)
-    if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED_SHARE:
+    if (filled := warp.visible.mean() / (height * width)) < _MIN_FILLED_FRACTION:
         reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"visible_share": float(filled), "tilt_deg": camera.tilt_deg})
         view = View(up_deg=camera.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
@@ -193,13 +193,13 @@ def level_image(
 
 def compute_level_rotation(frame: Frame, lens: Lens) -> Doubles:
     """Return the rotation (3, 3) from the axes of the lens to those of a level image with the same top, from the roll
-    and pitch of a frame (unknown: taken as 0) and the mount of the lens."""
+    and pitch of a frame (assumed 0 if unknown) and the mount of the lens."""
     return _CameraGeometry(frame, None, lens).straight
 
 
 def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
-    """Return the ground length in metres of the longest side that an image would have if it were level, from the
-    height of `frame` or, if unknown, of `vehicle`; None if unknown in both."""
+    """Return the ground length in metres that the longest side of an image would have if the image were level, from
+    the height in `frame` or, if unknown there, in `vehicle`; None if unknown in both."""
     *_, height_m = _choose_attitude(frame, vehicle)
     if height_m is None or not 0 < height_m <= _MAX_HEIGHT_M:
         return None
@@ -207,7 +207,7 @@ def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> floa
 
 
 def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> LevelledImage:
-    """Remove the distortion of `lens` (None: it has none) from an image that is not warped otherwise. `overlay` is as
+    """Remove the distortion of `lens` (None: no distortion) from an image that is not warped otherwise. `overlay`: as
     in `level_image`. Raises ImageError if the image's aspect ratio differs from that of the calibration."""
     if lens is None:
         return LevelledImage(image, overlay, view)
@@ -216,12 +216,12 @@ def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: Calibr
 
 
 def _warp_image(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> LevelledImage:
-    mask = warp.shown if overlay is None else warp.shown & warp.warp_mask(overlay)
+    mask = warp.visible if overlay is None else warp.visible & warp.warp_mask(overlay)
     return LevelledImage(warp.warp_image(image), None if mask.all() else mask, view)
 
 
 def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
-    """Enlarge an image around its middle, at the same size in pixels."""
+    """Enlarge an image around its middle; its size in pixels stays the same."""
     if zoom == 1:
         return picture
     height_px, width_px = picture.image.shape[:2]
@@ -235,9 +235,9 @@ def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
 
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
-    """Return the view of an image that cannot be warped because its lens is unknown: only with `nadir_offset_m`, or
-    only with `reason` if the image is tilted too far, or empty if too little is known. Arguments are as in
-    `level_image`; impossible values never raise."""
+    """Return the view of an image that cannot be warped because its lens is unknown. Only `nadir_offset_m` is set or,
+    if the image is tilted too far, only `reason`; nothing if too little is known. Arguments are as in `level_image`;
+    impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -261,8 +261,8 @@ class _CameraGeometry:
     `straight`: rotation from lens to level image without a turn about the vertical. `tilt_deg`: angle between the
     viewing direction and straight down; `is_too_tilted`: it is too large for a warp. `top_deg`: compass direction of
     the image's top. `footprint_m`: ground length of the longest side if the image were level. `corners` (3, n):
-    corners of the usable part of the image, whose rays point down enough, in homogeneous pixels. `is_tilt_known`:
-    from a reported attitude or, within a few degrees, from the mount alone."""
+    corners of the usable part of the image, where rays point down steeply enough, in homogeneous pixels.
+    `is_tilt_known`: from a reported attitude or, within a few degrees, from the mount alone."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, _ = _choose_attitude(frame, vehicle)
@@ -314,12 +314,12 @@ class _CameraGeometry:
         if not self.is_tilt_known:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px
-        by_tilt = _REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
-        return float(focal * by_tilt)
+        tilt_gain_sd = _REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
+        return float(focal * tilt_gain_sd)
 
 
 def _choose_attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
-    """Yield roll, pitch, heading (degrees) and height (m): each from the frame, else from the vehicle, else None."""
+    """Yield roll, pitch, heading (degrees) and height (m), each from the frame, else from the vehicle, else None."""
     for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m"):
         values = (getattr(frame, name), getattr(vehicle, name, None))
         yield next((value for value in values if value is not None and math.isfinite(value)), None)

@@ -1,4 +1,4 @@
-"""Live sources: cameras and network streams. Only the newest image counts; a source that delivers none is reopened.
+"""Live sources: cameras and network streams. Only the newest image is used; a source that delivers none is reopened.
 
 A call into a driver or a decoder may never return, and a thread that hangs in one cannot be killed. So one thread opens
 and reads the source, another converts the images that are used, and a third, which makes no calls that can hang,
@@ -23,11 +23,11 @@ _CLOSE_TIMEOUT_S = 0.5
 _POLL_PERIOD_S = 0.2
 _OPENING_TIMEOUT_S = 90.0  # longer than any opening that does not hang, see `frames.programs`
 _STALE_PICTURE_S = 1.0
-_MAX_HANGING_THREADS = 3  # so that a source that hangs each time does not use up threads
+_MAX_HANGING_THREADS = 3  # a source that hangs at every opening must not use up threads
 
 
 class _Opening:
-    """One opening of a camera or stream. `opened_s`: when it was open (None: not yet). `cause`: why it could not be
+    """One opening of a camera or stream. `opened_s`: when it succeeded (None: not yet). `cause`: why it could not be
     opened or read further, in a few words (None: lost or cancelled). `thread` runs `read` with this object."""
 
     def __init__(self, read: Callable[["_Opening"], None], began_s: float) -> None:
@@ -56,7 +56,7 @@ class _Conversion:
 
 
 class _Converter:
-    """A thread that converts the images in `requests` one after the other until it receives None."""
+    """A thread that converts the images in `requests` one by one until it receives None."""
 
     def __init__(self) -> None:
         self.requests: SimpleQueue[_Conversion | None] = SimpleQueue()
@@ -89,14 +89,14 @@ class LiveSource(Source):
         self._t_start_s = clock()
         self._captured = 0
         self._last_taken_s = float("-inf")
-        self._repeats = RepeatDetector()  # across openings: a server may begin with a stored image
+        self._repeats = RepeatDetector()  # kept across openings: a server may begin with a stored image
         self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
         self._conversion: _Conversion | None = None
         self._converter = _Converter()
         self._opening: _Opening | None = None
-        self._hanging: list[threading.Thread] = []  # abandoned threads
-        self._changed = threading.Condition()  # guards all of these
+        self._hanging: list[threading.Thread] = []  # abandoned because they hang
+        self._changed = threading.Condition()  # guards all attributes above
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._supervise, name="camera", daemon=True)
         self._thread.start()
@@ -126,7 +126,7 @@ class LiveSource(Source):
         return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s, delay_sd_s=shot.delay_sd_s)
 
     def close(self) -> None:
-        """Stop all threads. Returns after at most a second or so, whether they have ended or not."""
+        """Stop all threads. Returns after about a second at most, whether or not they have ended."""
         with self._changed:
             self._closing.set()
             opening = self._opening
@@ -173,7 +173,7 @@ class LiveSource(Source):
             self._converter.requests.put(None)
             self._hanging.append(self._converter.thread)
             self._converter, self._conversion = _Converter(), None
-            self._newest = None  # of the same decoder
+            self._newest = None  # from the same decoder
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
         if opening.opened_s is not None:
             return self._liveness.find_fault(now_s)

@@ -16,10 +16,10 @@ from edgevpr.frames.shot import make_thumbnail
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-# Formats whose first plane is luma: grey, bits per channel (none: 8), and byte order.
+# Formats whose first plane is luma. Groups: grey, bits per channel (none: 8), byte order.
 _LUMA_FORMATS = re.compile(r"(?:(gray)|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
-_SQUARE_TOLERANCE = 0.01  # in the aspect ratio of square pixels: its effect on positions is smaller than other errors
-_MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that claims more, or less than 1/4, is wrong
+_SQUARE_TOLERANCE = 0.01  # of the aspect ratio of square pixels: its effect on positions is smaller than other errors
+_MAX_ASPECT = 4.0  # the widest in use is 2.2; a claim of more than 4, or less than 1/4, is wrong
 
 
 class PixelConverter:
@@ -54,12 +54,12 @@ class PixelConverter:
         limits = self._depth.update(_read_luma(picture, layout))
         return lambda: to_8_bits(_read_luma(self._reformat(picture, picture.format.name, width_px), layout), limits)
 
-    def _reformat(self, picture: "VideoFrame", form: str, width_px: int | None = None) -> "VideoFrame":
-        converter: VideoReformatter | None = getattr(self._local, form, None)
+    def _reformat(self, picture: "VideoFrame", format_name: str, width_px: int | None = None) -> "VideoFrame":
+        converter: VideoReformatter | None = getattr(self._local, format_name, None)
         if converter is None:
             converter = VideoReformatter()
-            setattr(self._local, form, converter)
-        return converter.reformat(picture, width=width_px, format=form, interpolation="BICUBIC")
+            setattr(self._local, format_name, converter)
+        return converter.reformat(picture, width=width_px, format=format_name, interpolation="BICUBIC")
 
 
 def _match_layout(picture: "VideoFrame") -> re.Match[str] | None:

@@ -31,7 +31,7 @@ _COLUMN_LIMITS = {
     "rel_alt": ALT_LIMITS_M,
 }
 _TAG_COLUMNS = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m")
-_NEEDED_COLUMNS = ("file", "lat", "lon")
+_REQUIRED_COLUMNS = ("file", "lat", "lon")
 _TRACK_COLUMNS = ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # The years 1900 to 2200. A time in milliseconds, a thousand times too large, is out of range.
@@ -39,7 +39,7 @@ _MIN_TIME_S = -2_208_988_800
 _MAX_TIME_S = 7_258_118_400
 MAX_GAP_S = 5.0  # no interpolation across longer gaps: the aircraft may have turned
 _TIME_ROUNDING_S = 0.001  # Matroska stores milliseconds
-_ANGLE_INDICES = [1, 3, 4]  # of the angles that wrap at 360 degrees, in `_to_numbers`
+_ANGLE_INDICES = [1, 3, 4]  # positions in `_to_numbers` of the angles that wrap at 360 degrees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +63,7 @@ def find_positions(folder: str | Path) -> Path | None:
 
 
 def find_track(video: str | Path) -> Path | None:
-    """Return the path of the table of positions beside a video (same name, ending .csv), or None."""
+    """Return the path of the position table next to a video (same name with the extension .csv), or None."""
     table = Path(video).with_suffix(".csv")
     return table if table.is_file() else None
 
@@ -105,31 +105,31 @@ def _to_numbers(tag: GeoTag) -> tuple[Any, ...]:
     return *coordinates, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
 
 
-def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
-    """Read the rows of a table that must have the columns `needed`. Returns "FILE, line N" and the cells by column name
-    of each row. If `file` is needed, file names must be unique. Raises UsageError as `read_positions` does."""
+def _read_rows(csv_path: str | Path, required: Sequence[str] = _REQUIRED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
+    """Read the rows of a table that must have the columns `required`. Returns "FILE, line N" and the cells by column
+    name of each row. If `file` is required, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
         table = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
         table.fieldnames = header = [name.strip().lower() for name in table.fieldnames or ()]
         rows = [(f"{csv_path}, line {table.line_num}", row) for row in table]
     except OSError as error:
-        raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
+        raise UsageError(f"{csv_path} cannot be read ({error.strerror}): choose a readable CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{csv_path} is not a CSV text file ({error}): save it as CSV in UTF-8.") from error
-    for name in (*needed, *_COLUMN_LIMITS, "time"):
-        if header.count(name) > 1 or (name in needed and name not in header):
+    for name in (*required, *_COLUMN_LIMITS, "time"):
+        if header.count(name) > 1 or (name in required and name not in header):
             raise UsageError(
-                f"{csv_path}, line 1 must name each of the columns {', '.join(needed)} exactly once, separated by "
+                f"{csv_path}, line 1 must name each of the columns {', '.join(required)} exactly once, separated by "
                 f"commas; `{name}` is missing or repeated."
             )
     records, names = [], {""}
     for where, row in rows:
-        if None in row or None in row.values():  # how DictReader marks too many values, and too few
-            raise UsageError(f"{where} does not have as many values as line 1 has columns: correct it.")
+        if None in row or None in row.values():  # DictReader marks too many values, and too few, this way
+            raise UsageError(f"{where} must have as many values as line 1 has columns.")
         record = {name: value.strip() for name, value in row.items()}
-        if "file" in needed and record["file"] in names:
-            raise UsageError(f"{where} has no image name, or repeats an earlier one (`{record['file']}`): correct it.")
+        if "file" in required and record["file"] in names:
+            raise UsageError(f"{where}: `file` is `{record['file']}`, but must be a name that no earlier line has.")
         names.add(record.get("file", ""))
         records.append((where, record))
     return records
@@ -142,7 +142,7 @@ def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
     if lat_deg is not None and lon_deg is not None:
         position = make_position(lat_deg, lon_deg, values["alt"])
     elif lat_deg is not None or lon_deg is not None:
-        raise UsageError(f"{where} has only one of lat and lon: give both, or leave both empty.")
+        raise UsageError(f"{where} has only one of lat and lon: fill in both, or leave both empty.")
     heading_deg = values["yaw_deg"] if values["heading_deg"] is None else values["heading_deg"]
     return GeoTag(
         position=position,
@@ -169,7 +169,7 @@ def _parse_number(row: Mapping[str, str], column: str, low: float, high: float, 
     except ValueError:
         value = math.nan
     if not low <= value <= high:
-        raise UsageError(f"{where}: {column} is `{text}`: write a number from {low:g} to {high:g}.")
+        raise UsageError(f"{where}: {column} is `{text}`, but must be a number from {low:g} to {high:g}.")
     return value
 
 
@@ -179,8 +179,8 @@ def _parse_time_cell(row: Mapping[str, str], where: str) -> float | None:
         return parse_time(text) if text else None
     except (ValueError, OverflowError):
         raise UsageError(
-            f"{where}: time is `{text}`: write 2016-06-23T16:31:59Z, 2016:06:23 16:31:59 or seconds since 1970, "
-            "between 1900 and 2200."
+            f"{where}: time is `{text}`, but must be like 2016-06-23T16:31:59Z or 2016:06:23 16:31:59, or be seconds "
+            "since 1970, between the years 1900 and 2200."
         ) from None
 
 
@@ -231,13 +231,13 @@ class Track:
             height_m=height_m,
         )
 
-    def require_overlap(self, video: Path, lasts_s: float) -> None:
-        """Raise UsageError if the times of the table and of the video, which lasts `lasts_s` seconds, do not overlap.
+    def require_overlap(self, video: Path, duration_s: float) -> None:
+        """Raise UsageError if the times of the table and of the video, `duration_s` seconds long, do not overlap.
         `video`: its path, for the message."""
-        if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > lasts_s:
+        if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > duration_s:
             raise UsageError(
                 f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, but {video} runs from 0 "
-                f"to {lasts_s:.1f} s: give `time` in seconds from the first frame of the video."
+                f"to {duration_s:.1f} s: `time` must be in seconds from the first frame of the video."
             )
 
 
@@ -252,10 +252,10 @@ def read_track(csv_path: str | Path) -> Track:
             continue
         if tag.t_utc_s is None or (tags and tag.t_utc_s <= next(reversed(tags))):
             raise UsageError(
-                f"{where} has no time, or one that is not later than that of the line before: give the seconds from "
-                "the first frame of the video, in ascending order."
+                f"{where}: time must be in seconds from the first frame of the video, and later than in the line "
+                "before."
             )
         tags[tag.t_utc_s] = replace(tag, t_utc_s=None)
     if not tags:
-        raise UsageError(f"{csv_path} has no line with time, lat and lon: write one for each position of the video.")
+        raise UsageError(f"{csv_path} has no line with time, lat and lon: add one for each known position.")
     return Track(Path(csv_path), tuple(tags), tuple(tags.values()))

@@ -2,8 +2,8 @@
 camera, read with rpicam-vid; `gst: PIPELINE` is anything that GStreamer can read, with gst-launch-1.0.
 
 The program sends MJPEG over loopback, which is read like any stream, with the same timeouts. So the flight loads no
-camera library, and a camera that hangs does not stop it. The program dies with the thread that started it (setpriv),
-however that thread ends: a leftover program would block the camera."""
+camera library, and a camera that hangs does not stop it. The program is killed when the thread that started it ends
+(setpriv), for whatever reason: a leftover program would block the camera."""
 
 import logging
 import re
@@ -34,20 +34,20 @@ _ADVICE = {
     _RPICAM: "run `rpicam-hello --list-cameras` to see whether the camera is detected and in use",
     _GSTREAMER: "run `gst-launch-1.0 -v` with the pipeline to see why, and end it with raw video (video/x-raw)",
 }
-# At this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read out all of their pixels, binned. At a smaller
-# size some crop to the middle and see less.
+# At this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read out all pixels, binned. At a smaller size some
+# crop to the middle and see less.
 _SIZE_PX = (1280, 960)
 _RATE_HZ = 10
 _QUALITY = 90
-_APPSINK_PATTERN = re.compile(r"!\s*appsink\b[^!]*$")  # at the end of pipelines for OpenCV
-_MAX_QUEUED_PICTURES = 10  # if the reader does not keep up, older ones are dropped
-# From the start to the first picture. A camera needs a second or two; GStreamer's scan for plugins, or a sensor behind
-# several drivers, needs 10 s or more on a small board. A program stopped too early is as slow the next time.
+_APPSINK_PATTERN = re.compile(r"!\s*appsink\b[^!]*$")  # ends pipelines written for OpenCV
+_MAX_QUEUED_PICTURES = 10  # if the reader is slower, the oldest are dropped
+# From the start to the first picture. A camera needs a second or two; GStreamer's plugin scan, or a sensor that several
+# drivers share, needs 10 s or more on a small board. A program stopped too early is just as slow the next time.
 _FIRST_PICTURE_TIMEOUT_S = 60.0
 _POLL_PERIOD_S = 0.2
 _TERMINATE_TIMEOUT_S = 2.0
-_STDERR_LINES = 20  # the last of them are kept
-_STDERR_CHARS = 160  # a longer line is no help in a status
+_STDERR_LINES = 20  # number of last lines that are kept
+_STDERR_CHARS = 160  # a longer line does not help in a status
 _log = logging.getLogger(__name__)
 
 
@@ -60,7 +60,7 @@ def require_program(uri: str) -> str:
     path = shutil.which(name)
     if path is None:
         raise SourceError(
-            f"{name}, which reads this camera, is not installed: run `sudo apt install {_PACKAGES[name]}`."
+            f"{name}, which is needed to read this camera, is not installed: run `sudo apt install {_PACKAGES[name]}`."
         )
     return path
 
@@ -111,7 +111,7 @@ class ProgramCapture:
         self._stream.cancel()
 
     def release(self) -> None:
-        _terminate(self._process)  # first: a stream without a sender ends at once
+        _terminate(self._process)  # before the stream, which then ends at once
         self._stream.release()
 
 
@@ -145,7 +145,7 @@ def _choose_program(uri: str) -> str:
 def _make_rpicam_command(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a ribbon-cable camera to the first client at `port`."""
     return [
-        *("setpriv", "--pdeathsig", "KILL"),  # when our thread ends; the program has nothing to close
+        *("setpriv", "--pdeathsig", "KILL"),  # sent when our thread ends; the program has nothing to close
         *(require_program(uri), "--camera", uri.partition(":")[2] or "0", "--timeout", "0", "--nopreview"),
         *("--verbose", "0", "--codec", "mjpeg", "--quality", str(_QUALITY), "--framerate", str(_RATE_HZ)),
         *("--width", str(_SIZE_PX[0]), "--height", str(_SIZE_PX[1])),
@@ -154,19 +154,19 @@ def _make_rpicam_command(uri: str, port: int) -> list[str]:
 
 
 def _make_gstreamer_command(uri: str, port: int) -> list[str]:
-    """Return the command that sends the pictures of a pipeline to all clients at `port`. It runs on without them."""
+    """Return the command that sends the pictures of a pipeline to all clients at `port`, and waits for new ones."""
     sink = f"sync=false buffers-soft-max={_MAX_QUEUED_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     encoder = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    guard = "setpriv", "--pdeathsig", "TERM"  # when our thread ends; on this signal the program closes its camera
+    guard = "setpriv", "--pdeathsig", "TERM"  # sent when our thread ends, so that the program closes its camera
     return [*guard, require_program(uri), "-q", *_split_pipeline(uri), *encoder.split()]
 
 
 def _split_pipeline(uri: str) -> list[str]:
-    """Split a pipeline into words, without a final appsink. Raises SourceError if it is empty or a quote is open."""
+    """Split a pipeline into words and drop a final appsink. Raises SourceError if it is empty or a quote is open."""
     with suppress(ValueError):
         if words := shlex.split(_APPSINK_PATTERN.sub("", uri.removeprefix("gst:"))):
             return words
-    raise SourceError(f"`{uri}` is not a pipeline: write it as for gst-launch-1.0, after `gst:`, and close all quotes.")
+    raise SourceError(f"`{uri}` must be `gst:` and a pipeline in the syntax of gst-launch-1.0, with all quotes closed.")
 
 
 def _terminate(process: "subprocess.Popen[bytes]") -> None:

@@ -14,7 +14,7 @@ from edgevpr.frames.shot import OpeningError
 
 _VERSION_2 = 0x80  # the two highest bits of an RTP packet
 _HEADER_BYTES = 12
-_MAX_PACKETS = 10  # used to identify the codec: most are fragments, which look like no other codec's packets
+_MAX_PACKETS = 10  # to identify the codec; most are fragments, which cannot be mistaken for other codecs' packets
 _STATIC_TYPES = {26: "JPEG", 32: "MPV", 33: "MP2T"}  # payload types of RFC 3551
 _FIRST_DYNAMIC_TYPE = 96
 _H264_TYPES = (1, 5, 6, 7, 8, 9, 24, 28)  # NAL units, aggregates and fragments (RFC 6184)
@@ -31,7 +31,7 @@ def describe_rtp(uri: str, timeout_s: float) -> str | None:
     try:
         port = urlsplit(uri).port or 0
     except ValueError:
-        raise OpeningError("no host and port in the address") from None
+        raise OpeningError("the address must contain host and port") from None
     with _open_port(port) as receiver:
         packets = _receive_packets(receiver, timeout_s)
     if not packets and "?" in uri:  # FFmpeg may know from the options how to receive them
@@ -42,13 +42,13 @@ def describe_rtp(uri: str, timeout_s: float) -> str | None:
         return None
     codecs = Counter(codec for codec in map(_find_codec, packets) if codec)
     if not codecs:
-        kind = packets[0][1] & 0x7F
-        raise OpeningError(f"RTP with an unknown codec (payload type {kind}): describe it in an .sdp file")
+        payload_type = packets[0][1] & 0x7F
+        raise OpeningError(f"RTP with an unknown codec (payload type {payload_type}): describe it in an .sdp file")
     _open_port(port + 1).close()  # FFmpeg would not release the first port if the second were in use
-    (kind, codec), _ = codecs.most_common(1)[0]
+    (payload_type, codec), _ = codecs.most_common(1)[0]
     sdp = (
         "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=camera\nc=IN IP4 0.0.0.0\nt=0 0\n"
-        f"m=video {port} RTP/AVP {kind}\na=rtpmap:{kind} {codec}/90000\n"
+        f"m=video {port} RTP/AVP {payload_type}\na=rtpmap:{payload_type} {codec}/90000\n"
     )
     return f"data:application/sdp;base64,{base64.b64encode(sdp.encode()).decode()}"
 
@@ -84,15 +84,15 @@ def _is_rtp(packet: bytes) -> bool:
 
 def _find_codec(packet: bytes) -> tuple[int, str] | None:
     """Return the payload type and codec name of an RTP packet; None if the packet does not reveal the codec."""
-    kind, start = packet[1] & 0x7F, _HEADER_BYTES + 4 * (packet[0] & 0x0F)
-    if packet[0] & 0x10:  # an extension, with its length in words
+    payload_type, start = packet[1] & 0x7F, _HEADER_BYTES + 4 * (packet[0] & 0x0F)
+    if packet[0] & 0x10:  # a header extension, whose length is counted in words
         start += 4 + 4 * int.from_bytes(packet[start + 2 : start + 4], "big")
     payload = packet[start : start + 2]
-    if kind in _STATIC_TYPES:
-        return kind, _STATIC_TYPES[kind]
-    if kind < _FIRST_DYNAMIC_TYPE or len(payload) < 2 or payload[0] & 0x80:
+    if payload_type in _STATIC_TYPES:
+        return payload_type, _STATIC_TYPES[payload_type]
+    if payload_type < _FIRST_DYNAMIC_TYPE or len(payload) < 2 or payload[0] & 0x80:
         return None
     # The second byte of H.265 has a layer (0) and a temporal layer (from 1); in H.264 it is data or a fragment type.
     if payload[0] >> 1 in _H265_TYPES and not payload[0] & 1 and 1 <= payload[1] <= 7:
-        return kind, "H265"
-    return (kind, "H264") if payload[0] & 0x1F in _H264_TYPES else None
+        return payload_type, "H265"
+    return (payload_type, "H264") if payload[0] & 0x1F in _H264_TYPES else None

@@ -1,7 +1,7 @@
 """Detects whether two images show the same unmoved scene, regardless of noise and on-screen clock or display.
 (`shot.RepeatDetector` finds exactly equal images before they are fully decoded.)
 
-Coarse copies are compared block by block. The texture of a block determines by how much its correlation drops if the
+Coarse copies are compared block by block. The texture of a block determines how much its correlation drops if the
 image moves by 1.5 of their pixels in any direction; a block with a smaller drop has not moved. So no threshold
 depends on the kind of ground or its contrast. Blocks that cannot show every motion, such as furrows, are not used."""
 
@@ -17,8 +17,8 @@ _SIZE_PX = (128, 96)  # columns and rows of a coarse copy
 _BLOCK_PX = 16
 _MIN_TEXTURE_LEVELS = 2.5  # standard deviation of a block, grey levels; the noise of a dark image is lower
 _MOTION_PX = 1.5
-_MIN_LOSS = 0.05  # of correlation through that motion: a smaller loss may be compression noise
-_MAX_READ_COLUMNS = 640  # columns to average; a larger image is subsampled first
+_MIN_LOSS = 0.05  # of correlation due to that motion; a smaller loss may be compression noise
+_MAX_READ_COLUMNS = 640  # columns that are averaged; a larger image is subsampled first
 _THUMBNAIL_PX = (16, 12)
 BLOCK_COUNT = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
 
@@ -31,7 +31,7 @@ class CoarseImage:
 
     @cached_property
     def blocks(self) -> Singles:
-        """Blocks, float32 (48, 256), each minus its mean and normalised to length 1; zero if without texture."""
+        """Blocks, float32 (48, 256), each minus its mean and normalised to length 1; zero if it has no texture."""
         blocks = _cut_blocks(self.grey)
         blocks = blocks - blocks.mean(axis=1, keepdims=True)
         length = np.linalg.norm(blocks, axis=1, keepdims=True)
@@ -62,7 +62,7 @@ class CoarseImage:
         return np.asarray(self.blocks.any(axis=1) & (self.min_loss > _MIN_LOSS))
 
     def find_unmoved_blocks(self, other: "CoarseImage") -> Bools:
-        """Return True for each textured block that is unmoved in the other image, bool (48,)."""
+        """Return True for each textured block that has not moved in the other image, bool (48,)."""
         loss = 1 - (self.blocks * other.blocks).sum(axis=1)
         return np.asarray(self.is_textured & (loss < self.min_loss))
 

@@ -1,7 +1,7 @@
 """Pictures of a camera or stream (`Shot`), their source (`Capture`), and the detection of repeats (`RepeatDetector`).
 
-A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report it. But noise makes
-every new picture of a camera different. Coarse grey copies of the pictures are compared in bands of rows."""
+Decoders that fill lost parts from older pictures, and cameras that hang, do not always report it. But noise makes every
+new picture of a camera different, so coarse grey copies of the pictures are compared in bands of rows."""
 
 from collections import deque
 from collections.abc import Callable
@@ -20,14 +20,14 @@ Plane = TypeVar("Plane", bound=NDArray[Any])
 _MIN_THUMBNAIL_PX = (60, 80)  # rows and columns of a coarse copy
 _BANDS = 12
 _HISTORY_PICTURES = 6  # decoders rotate through about as many buffers
-# Bands are equal if this share of their pixels differs by at most this many grey levels.
-_MIN_EQUAL_SHARE = 0.99
+# Bands are equal if this fraction of their pixels differs by at most this many grey levels.
+_MIN_EQUAL_FRACTION = 0.99
 _MAX_EQUAL_LEVELS = 1
-_MIN_TEXTURE_LEVELS = 8.0  # in grey levels: bands with a smaller standard deviation are not judged
-_MIN_CHANGE_LEVELS = 3.0  # in grey levels: a band with a larger mean difference has certainly changed
+_MIN_TEXTURE_LEVELS = 8.0  # standard deviation in grey levels; bands with a smaller one are not judged
+_MIN_CHANGE_LEVELS = 3.0  # mean difference in grey levels; a band with a larger one has certainly changed
 _MIN_BANDS = 2
-_LEARNING_PICTURES = 8  # time constant of the share of pictures in which a band changed
-_MIN_CHANGE_SHARE = 0.75  # a band that changed in a smaller share of pictures is not judged
+_LEARNING_PICTURES = 8  # time constant of the fraction of pictures in which a band changed
+_MIN_CHANGE_RATE = 0.75  # a band that changed in a smaller fraction of pictures is not judged
 
 
 class Condition(Enum):
@@ -47,7 +47,7 @@ class Condition(Enum):
 class Refusal(Enum):
     """The reason why a picture is rejected. DAMAGED: it is incomplete, or was decoded from an incomplete one. PATCHED:
     parts of it are copies from an older picture. FROZEN: it equals the previous picture. LATE: its age is unknown
-    because it was buffered before the source was opened, arrived out of order or has a bad time stamp; or it was
+    because it was buffered before the source was opened, arrived out of order or has a bad timestamp; or it was
     skipped because decoding lags behind."""
 
     DAMAGED = "damaged"
@@ -76,8 +76,8 @@ class OpeningError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamFacts:
-    """A stream's own description of its pictures. `pixel_aspect`: width of a pixel divided by its height. `rate_hz`:
-    None if not stated."""
+    """How a stream describes its pictures. `pixel_aspect`: width of a pixel divided by its height. `rate_hz`: picture
+    rate, None if not stated."""
 
     codec: str
     bits: int
@@ -85,7 +85,7 @@ class StreamFacts:
     rate_hz: float | None
 
     def __str__(self) -> str:
-        shape = "square pixels" if self.pixel_aspect == 1 else f"pixels {self.pixel_aspect:.3g} times as wide as high"
+        shape = "square pixels" if self.pixel_aspect == 1 else f"pixel aspect ratio {self.pixel_aspect:.3g}"
         rate = f", {self.rate_hz:.3g} pictures per second" if self.rate_hz else ""
         return f"{self.codec}, {self.bits} bits per channel, {shape}{rate}"
 
@@ -119,7 +119,7 @@ class RepeatDetector:
 
     def __init__(self) -> None:
         self._history: deque[NDArray[np.int16]] = deque(maxlen=_HISTORY_PICTURES)  # pictures as bands, newest first
-        self._change_share = np.zeros(_BANDS)  # share of the latest pictures in which each band changed
+        self._change_rate = np.zeros(_BANDS)  # fraction of the latest pictures in which each band changed
 
     def find_repeat(self, thumbnail: Image) -> Refusal | None:
         """Return why the picture with the coarse copy `thumbnail`, uint8 (h, w), is not new; None if it is new."""
@@ -129,14 +129,14 @@ class RepeatDetector:
             self._history.appendleft(bands)
             return None
         differences = np.abs(np.stack(self._history) - bands)
-        is_equal = (differences <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_SHARE  # (pictures, bands)
+        is_equal = (differences <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_FRACTION  # (pictures, bands)
         if is_equal[0].all():
             return Refusal.FROZEN  # not stored, so that it does not displace an older picture
         self._history.appendleft(bands)
         has_changed = (differences[0].mean(-1) > _MIN_CHANGE_LEVELS) & ~is_equal[0]
-        should_change = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._change_share > _MIN_CHANGE_SHARE)
+        should_change = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._change_rate > _MIN_CHANGE_RATE)
         is_patched = ((is_equal & should_change).sum(-1) >= _MIN_BANDS).any()
         if is_patched and has_changed.sum() >= _MIN_BANDS:
-            return Refusal.PATCHED  # before the update below: a band that stays patched must not become static
-        self._change_share += (has_changed - self._change_share) / _LEARNING_PICTURES
+            return Refusal.PATCHED  # not counted below: a band that stays patched must not count as static
+        self._change_rate += (has_changed - self._change_rate) / _LEARNING_PICTURES
         return None

@@ -27,7 +27,7 @@ _SNAPSHOT_PERIOD_S = 0.5
 _PROGRAM_PATTERN = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
 # udp://:PORT: on all interfaces.
 _ADDRESS_PATTERN = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
-# A password with a character at which FFmpeg stops looking for the password in an address. A port is not a password.
+# A password with a character at which FFmpeg stops parsing it. A port is not mistaken for a password.
 _UNESCAPED_PASSWORD = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*@.*", re.DOTALL)
 
 
@@ -93,8 +93,8 @@ def make_frame(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
 
 
 class FolderSource(RecordingSource):
-    """Delivers each image of a folder once, in counting order of the names (2 before 10). Position, attitude and time
-    are from its line in the table of positions, else from its EXIF data. See `open_source` for the arguments."""
+    """Delivers each image of a folder once, in numeric order of the names (2 before 10). Position, attitude and time
+    are from its line in the position table, else from its EXIF data. See `open_source` for the arguments."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class FolderSource(RecordingSource):
         paths = {decode_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         self._tags = _read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
-            raise UsageError(f"{positions} lists none of the images in {folder}: correct its column `file`.")
+            raise UsageError(f"{positions} lists none of the images in {folder}: correct the column `file`.")
         self._unread = [(name, path) for name, path in paths.items() if self.is_selected(name)][::-1]
         self.total = len(self._unread)
         self._clock = clock
@@ -146,14 +146,14 @@ def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]
 
 
 def read_intervals(uri: str | None, positions: Path | None = None) -> list[float]:
-    """Read the seconds from each image of a folder to the next, from their times in `positions` or EXIF data. Empty if
-    `uri` is not a usable folder, an image has no time, one is older than the one before it, or all times are equal."""
-    times: list[float | None] = []
+    """Return the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty if
+    `uri` is not a usable folder, an image has no time or is older than the one before it, or all times are equal."""
+    times_s: list[float | None] = []
     if uri is not None and os.path.isdir(uri):
         with suppress(EdgevprError):
-            times = [tag.t_utc_s for tag in read_tags(Path(uri), positions).values()]
-    steps_s = [later - earlier for earlier, later in pairwise(times) if earlier is not None and later is not None]
-    is_ordered = len(steps_s) == len(times) - 1 and min(steps_s, default=-1) >= 0
+            times_s = [tag.t_utc_s for tag in read_tags(Path(uri), positions).values()]
+    steps_s = [later - earlier for earlier, later in pairwise(times_s) if earlier is not None and later is not None]
+    is_ordered = len(steps_s) == len(times_s) - 1 and min(steps_s, default=-1) >= 0
     return steps_s if is_ordered and any(steps_s) else []
 
 
@@ -170,28 +170,28 @@ def open_source(
     """Open the source at `uri`: a path, device or address.
 
     `step_s`: minimum video time in seconds between two frames of a video file (None: every frame); for the address of a
-    single image, seconds between two requests (None: 0.5). `positions`: table of the positions of a recording (None:
-    for a folder, the positions.csv in or beside it, else EXIF data; for a video, the .csv of the same name beside it).
-    `live`: allow cameras and streams, which never end. A missing one is opened as soon as it appears. `clock`: the
+    single image, seconds between two requests (None: 0.5). `positions`: position table of a recording (None: for a
+    folder, the positions.csv in or next to it, else EXIF data; for a video, the .csv of the same name next to it).
+    `live`: allow cameras and streams, which never end. A missing one is opened once it appears. `clock`: the
     monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
     that is replayed at its original times, the result of `read_intervals`.
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
     if positions and is_live(uri):
-        raise UsageError(f"{positions} is a table for recordings, but {uri} is live: leave the table out.")
+        raise UsageError(f"{positions} is a position table for recordings, but {uri} is live: omit the table.")
     if os.path.isdir(uri):  # Path.is_dir raises OSError for a long pipeline
         return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s)
     if is_live(uri):
         if not live:
-            raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
+            raise SourceError(f"{uri} is live and never ends: use a folder of images or a video file instead.")
         from edgevpr.frames.live import LiveSource
 
         return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
     if not path.is_file():
-        raise SourceError(f"There is nothing at `{uri}`: give {SOURCE_HELP}.")
+        raise SourceError(f"There is nothing at `{uri}`: choose {SOURCE_HELP}.")
     if path.name.lower().endswith(EXTENSIONS):
-        raise SourceError(f"{uri} is a single image: give the folder that contains it.")
+        raise SourceError(f"{uri} is a single image: use the folder that contains it.")
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
     table = positions or find_track(path)
@@ -230,7 +230,7 @@ def find_missing_cause(uri: str) -> str | None:
     if not Path(uri).exists():
         return f"there is nothing at {uri}"
     if not os.access(uri, os.R_OK):
-        return f"this user may not read {uri}: add the user to the group of that file, often `video`"
+        return f"this user may not read {uri}: add the user to the group that owns it, often `video`"
     return None
 
 
@@ -244,12 +244,12 @@ def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Call
         return lambda: open_program(uri, clock)
     if "://" in uri and _UNESCAPED_PASSWORD.fullmatch(uri):
         raise SourceError(
-            "The password in the address of the source must be percent-encoded: write %2F for /, %23 for #, %3F "
+            "The password in the address of the source must be percent-encoded: use %2F for /, %23 for #, %3F "
             "for ?, %40 for @, %25 for % and %20 for a space."
         )
     if "://" in uri and not _ADDRESS_PATTERN.fullmatch(uri):
         raise SourceError(
-            f"{uri} is not the address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCE_HELP}."
+            f"{uri} is not the address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: use {SOURCE_HELP}."
         )
 
     def open_capture() -> Capture:

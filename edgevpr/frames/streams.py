@@ -22,7 +22,7 @@ OPEN_TIMEOUT_S = 5.0
 READ_TIMEOUT_S = 15.0
 UDP_READ_TIMEOUT_S = 3.0
 # RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
-# back at least two packets while it waits for a missing one. Probing for the frame rate, which is not needed, would
+# back at least two packets while it waits for a missing one. Probing the frame rate, which is not needed, would
 # exceed the opening timeout at 1 image/s. FFmpeg opens addresses in an .sdp file only for whitelisted protocols.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": "0"}
 # Some cameras send RTSP over UDP only. FFmpeg then waits 0.1 s for a missing packet, and reports it.
@@ -41,30 +41,30 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
     response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
-    kind = response.headers.get_content_type() if response else ""
+    content_type = response.headers.get_content_type() if response else ""
     timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
-    if response and kind.startswith("multipart/"):
+    if response and content_type.startswith("multipart/"):
         parts = ResponseFile(response, is_multipart=True)
         return StreamCapture(open_decoder(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
-    if response and kind == "application/octet-stream":  # FFmpeg as a server would not answer a second request
+    if response and content_type == "application/octet-stream":  # if FFmpeg is the server, it answers one request only
         file = ResponseFile(response, is_multipart=False)
         return StreamCapture(open_decoder(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
     if response:
         response.close()
-    if kind.startswith("image/"):
+    if content_type.startswith("image/"):
         return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock)
-    if kind == "text/html":
-        raise OpeningError(f"no video at this address but {kind}")
+    if content_type == "text/html":
+        raise OpeningError(f"no video at this address, only {content_type}")
     return StreamCapture(_open_stream(uri), clock, opened_s)
 
 
 def open_raw(
-    uri: str, clock: Callable[[], float], form: str, timeout_s: float, delay_sd_s: float = FRAME_TIME_SD_S
+    uri: str, clock: Callable[[], float], format_name: str, timeout_s: float, delay_sd_s: float = FRAME_TIME_SD_S
 ) -> "StreamCapture":
-    """Open a stream in a format without time stamps (`form`: its name in FFmpeg), and wait up to `timeout_s` seconds
-    for its first image. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
+    """Open a stream in a format without timestamps (`format_name`: its name in FFmpeg), and wait up to `timeout_s`
+    seconds for its first image. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
     opened_s = clock()
-    decoder = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
+    decoder = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), format_name)
     return StreamCapture(decoder, clock, opened_s, delay_sd_s)
 
 
@@ -137,7 +137,7 @@ class StreamCapture:
         dts = packet.pts if packet.dts is None else packet.dts
         stamped.record_arrival(packet.pts * unit_s, dts * unit_s, arrival.arrival_s, packet.size)
         if stamped.is_live:
-            self._decoder.is_backlog_doubtful = False  # from now on, packets were sent after the opening
+            self._decoder.is_backlog_doubtful = False  # the packets from now on were sent after the opening
 
     def _make_shot(self, picture: "VideoFrame", unstamped: CaptureTime, arrival_s: float) -> Shot | Refusal:
         taken: CaptureTime | None = unstamped

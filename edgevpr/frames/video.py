@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska stores milliseconds
 _DEFAULT_RATE_HZ = 25.0
-_MAX_MISSING_S = 1.0  # at the end, tolerated without a report: other streams in the file may be longer
+_MAX_MISSING_S = 1.0  # at the end, not reported: other streams in the file may be longer
 
 
 def read_start_s(path: Path) -> tuple[float | None, float]:
-    """Return the start of a video, in seconds since 1970 by the camera's clock (None: unknown), and its duration in
+    """Return the start of a video, in seconds since 1970 on the camera's clock (None: unknown), and its duration in
     seconds (0: unknown). Raises SourceError for a file that is not a video."""
     decoder = _open_video(path, "the video file of the positions")
     start = {**decoder.container.metadata, **decoder.stream.metadata}.get("creation_time")
@@ -38,7 +38,7 @@ def _open_video(path: Path, advice: str) -> VideoDecoder:
     try:
         return open_decoder(str(path), {})
     except OpeningError:
-        raise SourceError(f"{path} is not a video that can be decoded: give {advice}.") from None
+        raise SourceError(f"{path} is not a video that can be decoded: use {advice}.") from None
 
 
 class VideoSource(RecordingSource):
@@ -63,10 +63,10 @@ class VideoSource(RecordingSource):
         stream = decoder.stream
         self._first_stamp = stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _DEFAULT_RATE_HZ)
-        lasts_s = stream.duration * decoder.unit_s if stream.duration else (decoder.container.duration or 0) / 1e6
-        stated_s = lasts_s if decoder.is_stamped else 0.0
+        duration_s = stream.duration * decoder.unit_s if stream.duration else (decoder.container.duration or 0) / 1e6
+        stated_s = duration_s if decoder.is_stamped else 0.0
         frames = stream.frames or stated_s / self._frame_s
-        self._expected_s = max(stated_s, stream.frames * self._frame_s)  # truncated AVI: only the latter is right
+        self._expected_s = max(stated_s, stream.frames * self._frame_s)  # in a truncated AVI only the latter is right
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
         if track and self._expected_s:
             track.require_overlap(path, self._expected_s)
@@ -114,25 +114,25 @@ class VideoSource(RecordingSource):
         """Advance index and video time to `picture`, the next one decoded; return True if it should be returned."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._decoder.unit_s
-        # Without usable time stamps, as in a raw H.264 or MJPEG file, the frame rate is used.
+        # Without usable timestamps, as in a raw H.264 or MJPEG file, the frame rate is used.
         self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
         return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S
 
-    def _report_damage(self, until: str = "") -> None:
+    def _report_damage(self, suffix: str = "") -> None:
         count, first, t_s = self._damaged, self._index + 1, self._t_s + self._frame_s
         self.refused[Refusal.DAMAGED.value] += count
         self._damaged, self._index = 0, self._index + count
         self._t_s += 0.0 if self._decoder.is_stamped else count * self._frame_s
-        which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
+        frames = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
-            f"{self._path}: {which} cannot be used{until} (damaged, or dependent on damaged frames): "
+            f"{self._path}: {frames} cannot be used{suffix} (damaged, or dependent on damaged frames): "
             "copy the video again.",
             count,
         )
 
     def _finish(self) -> None:
         if self._damaged:
-            self._report_damage(until=" up to the end of the file")
+            self._report_damage(suffix=" up to the end of the file")
         self.end()
         missing_s = self._expected_s - self._read_s - self._frame_s
         if missing_s > _MAX_MISSING_S:

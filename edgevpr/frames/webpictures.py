@@ -1,5 +1,5 @@
 """Images over HTTP that FFmpeg cannot read as a stream: the address of a single image, requested repeatedly
-(`SnapshotCapture`), and a multipart stream with parts of any image type (`ResponseFile`)."""
+(`SnapshotCapture`), and a multipart stream whose parts are images of any type (`ResponseFile`)."""
 
 import http.client
 import re
@@ -18,7 +18,7 @@ from edgevpr.frames.images import decode_image, encode_jpeg, is_whole_jpeg
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, make_thumbnail
 
 _MAX_BYTES = 64_000_000  # of one image
-_MAX_PART_S = 15.0  # for one image of a multipart stream: a trickling sender must not block a thread for ever
+_MAX_PART_S = 15.0  # for one image of a multipart stream: a slow sender must not block a thread for ever
 _CHUNK_BYTES = 65536
 _MAX_PERIOD_S = 1.0  # from one request for an image to the next
 _JPEG_START = b"\xff\xd8"
@@ -60,20 +60,20 @@ def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
 
 
 class SnapshotCapture:
-    """A `Capture` that requests the image at `uri` every `period_s` seconds. Its time is that of the request, when
-    most cameras take it. A camera that returned the same file twice keeps an image ready, which may be as old as the
-    previous request."""
+    """A `Capture` that requests the image at `uri` every `period_s` seconds. Its capture time is that of the request,
+    when most cameras take it. A camera that returned the same file twice keeps an image ready, which may be as old as
+    the previous request."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
         self._period_s = min(period_s, _MAX_PERIOD_S)
-        self._due_s = self._request_s = clock()
-        self._data, self._is_kept, self._depth = b"", False, DepthRange()
+        self._next_request_s = self._request_s = clock()
+        self._data, self._is_buffered, self._depth = b"", False, DepthRange()
 
     def read(self) -> Shot | Refusal | None:
-        time.sleep(max(0.0, self._due_s - self._clock()))
+        time.sleep(max(0.0, self._next_request_s - self._clock()))
         last_request_s, self._request_s = self._request_s, self._clock()
-        self._due_s = self._request_s + self._period_s
+        self._next_request_s = self._request_s + self._period_s
         try:
             with send_request(self._uri, self._timeout_s) as response:
                 data = response.read(_MAX_BYTES)
@@ -83,16 +83,16 @@ class SnapshotCapture:
             return Refusal.DAMAGED
         except _REQUEST_ERRORS:
             return None
-        self._is_kept = self._is_kept or data == self._data
+        self._is_buffered = self._is_buffered or data == self._data
         self._data = data
         plane = image if image.ndim == 2 else image[:, :, 1]
-        taken_s = last_request_s if self._is_kept else self._request_s
-        sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else arrival_s - self._request_s)
+        taken_s = last_request_s if self._is_buffered else self._request_s
+        sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_buffered else arrival_s - self._request_s)
         times = {"t_mono_s": taken_s, "t_sd_s": sd_s, "delay_sd_s": HIDDEN_DELAY_SD_S}
         return Shot(thumbnail=make_thumbnail(plane), convert=lambda: image, **times)
 
     def cancel(self) -> None:
-        """Do nothing: a request lasts a few seconds at most."""
+        """Do nothing: a request takes a few seconds at most."""
 
     def release(self) -> None:
         """Do nothing: no connection stays open between requests."""
@@ -121,11 +121,11 @@ def _read_chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
 
 def _read_parts(response: http.client.HTTPResponse) -> Iterator[bytes]:
     boundary = re.escape((response.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace"))
-    head = re.compile(boundary + rb"[^\n]*\n((?:[^\r\n]+\r?\n)*)\r?\n")
+    headers = re.compile(boundary + rb"[^\n]*\n((?:[^\r\n]+\r?\n)*)\r?\n")
     received, last_part_s = bytearray(), time.monotonic()
     for chunk in _read_chunks(response):
         received += chunk
-        while (part := head.search(received)) and (end := _find_end(received, part, boundary)):
+        while (part := headers.search(received)) and (end := _find_end(received, part, boundary)):
             data = bytes(received[part.end() : end])
             del received[:end]
             last_part_s = time.monotonic()
@@ -137,8 +137,8 @@ def _read_parts(response: http.client.HTTPResponse) -> Iterator[bytes]:
 
 
 def _find_end(received: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
-    """Return the end of the image that begins after the head of a `part`; 0 if it has not arrived. Without a stated
-    length, a JPEG ends at its end marker. FFmpeg would wait for the next part, making each image one period older."""
+    """Return the end of the image that begins after the headers of a `part`; 0 if it has not arrived. Without a stated
+    length, a JPEG ends at its end marker. FFmpeg would wait for the next part: one frame period more delay."""
     start = part.end()
     if length := re.search(rb"(?im)^content-length:\s*(\d+)", part[1]):
         end = start + int(length[1])

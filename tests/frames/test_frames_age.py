@@ -1,4 +1,4 @@
-"""The time at which pictures of a stream were taken, by their time stamps and by when they arrived."""
+"""The time at which pictures of a stream were taken, by their timestamps and by when they arrived."""
 
 import math
 

@@ -84,18 +84,18 @@ def test_parse_time_refuses(text):
 @pytest.mark.parametrize(
     ("row", "complaint"),
     [
-        ("b.jpg,ref,north,2,,,,", "line 3: lat is `north`: write a number from -90 to 90."),
+        ("b.jpg,ref,north,2,,,,", "line 3: lat is `north`, but must be a number from -90 to 90."),
         ("b.jpg,ref,nan,2,,,,", "line 3: lat is `nan`"),
-        ("b.jpg,ref,46,-181,,,,", "line 3: lon is `-181`: write a number from -180 to 180."),
-        ("b.jpg,ref,46,2,,low,,", "line 3: rel_alt is `low`: write a number from -1000 to 100000."),
+        ("b.jpg,ref,46,-181,,,,", "line 3: lon is `-181`, but must be a number from -180 to 180."),
+        ("b.jpg,ref,46,2,,low,,", "line 3: rel_alt is `low`, but must be a number from -1000 to 100000."),
         ("b.jpg,ref,46,2,,,,noon", "line 3: time is `noon`"),
-        ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`: write 2016-06-23T16:31:59Z"),  # ms
+        ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`, but must be like 2016-06-23"),  # ms
         ("b.jpg,ref,46,2,,,,0001-01-01T00:00:00+14:00", "line 3: time is"),
         ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
-        ("b.jpg,46,2", "line 3 does not have as many values"),
-        ("b.jpg,ref,46,84,2,0,,,,", "line 3 does not have as many values"),
-        (",ref,46,2,,,,", "line 3 has no image name"),
-        ("0000.jpg,ref,46,2,,,,", "repeats an earlier one (`0000.jpg`)"),
+        ("b.jpg,46,2", "line 3 must have as many values"),
+        ("b.jpg,ref,46,84,2,0,,,,", "line 3 must have as many values"),
+        (",ref,46,2,,,,", "line 3: `file` is ``, but must be a name that no earlier line has"),
+        ("0000.jpg,ref,46,2,,,,", "`file` is `0000.jpg`, but must be a name that no earlier line has"),
     ],
 )
 def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, written):
@@ -183,8 +183,8 @@ def test_tag_at_makes_nothing_up_outside_the_table_and_in_wide_gaps(track):
     ("text", "said"),
     [
         ("file,lat,lon\na.jpg,1,2\n", "`time` is missing or repeated"),
-        ("time,lat,lon\n2,2,3\n1,2,3\n", "line 3 has no time, or one that is not later than that of the line before"),
-        ("time,lat,lon\n,2,3\n", "line 2 has no time"),
+        ("time,lat,lon\n2,2,3\n1,2,3\n", "line 3: time must be in seconds from the first frame"),
+        ("time,lat,lon\n,2,3\n", "line 2: time must be in seconds"),
         ("time,lat,lon\nsoon,2,3\n", "line 2: time is `soon`"),
         ("time,lat,lon\n1,,\n2,0,0\n", "has no line with time, lat and lon"),
     ],

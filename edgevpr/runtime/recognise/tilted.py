@@ -32,7 +32,7 @@ def measure_again(picture: LevelledImage, technique: Technique, fine: Array, fir
     corners = clip_polygon(corners, (out_from_pixel @ corners)[2] - _MIN_SCALE)
     scale = math.sqrt(math.prod(first.scales))
     warp = Homography(out_from_pixel, corners, side, longest / (side * scale))
-    mask = warp.shown if picture.mask is None else warp.shown & warp.warp_mask(picture.mask)
+    mask = warp.visible if picture.mask is None else warp.visible & warp.warp_mask(picture.mask)
     warped = technique.encode(warp.warp_image(picture.image), mask)
     again = technique.measure_perspective(warped, fine, _UNSHIFTED)
     if again is None or again.regions < _MIN_REGIONS_RATIO * first.regions:
