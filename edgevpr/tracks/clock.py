@@ -1,8 +1,8 @@
 """Estimates the offset between the clocks of a downward camera and a track from the camera's pictures.
 
-Two consecutive pictures that overlap show how the aircraft moved between them, in the frame of the first; three show
-how its movement changed: its length ratio and turn angle. Mounting, heading and footprint cancel out. The track gives
-the same quantities for any three times: where both agree, the clock is right. A straight flight gives no estimate.
+Two consecutive pictures that overlap show how the aircraft moved between them, in the frame of the first. Three show
+how this motion changed: length ratio and turn angle, in which mounting, heading and footprint cancel out. The track
+yields the same quantities for any three times; the best offset makes both agree. A straight flight yields no estimate.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,38 +20,38 @@ from edgevpr.runtime.recognise.agreement import MIN_PROVEN_INLIERS, Overlay, mea
 from edgevpr.runtime.recognise.landmarks import Landmarks, detect_landmarks
 
 _MAX_LANDMARKS = 500
-_MAX_OFFSET_S = 180.0  # a larger offset means a wrongly set clock, not drift
+_MAX_OFFSET_S = 180.0  # a larger offset means that the clock was set wrong, not that it drifted
 _STEP_S = 0.25
-_MAX_CHANGE = 1.0  # a larger difference is an error in the pictures or in the track
+_MAX_CHANGE = 1.0  # a larger difference is due to an error in the pictures or in the track
 # The cost ratio is 0.83 on aerial_caliterra, and at least 0.95 for pictures of one flight on the track of another.
 _MIN_TURNS = 4
 _MIN_TURN_RAD = 0.3
 _MIN_RIVAL_OFFSET_S = 4.0
 _MAX_COST_RATIO = 0.9
-Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as for a tie in `mapmaking.graph`
+Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as in `mapmaking.graph.Tie`
 
 
 def estimate_clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
-    """Estimate the offset to add to `times_s`, the times of the pictures `paths`, to get track times: at most three
-    minutes. None if the pictures do not show it."""
-    numbers, changes = _find_changes(paths)
-    if len(numbers) < _MIN_TURNS:
+    """Estimate the offset that converts `times_s`, the times of the pictures `paths`, to track times: at most three
+    minutes. None if the pictures do not determine it."""
+    indices, changes = _find_changes(paths)
+    if len(indices) < _MIN_TURNS:
         return None
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + _STEP_S, _STEP_S)
     places = _interpolate_track(track, np.array(times_s) + offsets_s[:, None])
-    costs, turn_counts = np.array([_compute_cost(points, numbers, changes) for points in places]).T
+    costs, turn_counts = np.array([_compute_cost(points, indices, changes) for points in places]).T
     best = int(np.argmin(costs))
-    is_rival = abs(offsets_s - offsets_s[best]) > _MIN_RIVAL_OFFSET_S
-    if turn_counts[best] < _MIN_TURNS or costs[best] > _MAX_COST_RATIO * costs[is_rival].min():
+    is_distant = abs(offsets_s - offsets_s[best]) > _MIN_RIVAL_OFFSET_S
+    if turn_counts[best] < _MIN_TURNS or costs[best] > _MAX_COST_RATIO * costs[is_distant].min():
         return None
     return float(offsets_s[best])
 
 
-def _compute_cost(points: Complexes, numbers: Ints, changes: Complexes) -> tuple[float, float]:
-    """Return how much the changes of movement differ, 0..1, and how many turns agree, if the pictures were taken at
-    `points`, complex (N,). `numbers`, int (C,): number of the first of the three pictures of each change."""
+def _compute_cost(points: Complexes, indices: Ints, changes: Complexes) -> tuple[float, float]:
+    """Return the mean difference between measured and expected changes of motion, 0..1, and the number of turns that
+    agree, if the pictures were taken at `points`, complex (N,). `indices`, int (C,): first picture of each change."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        expected = np.log((points[numbers + 2] - points[numbers + 1]) / (points[numbers + 1] - points[numbers]))
+        expected = np.log((points[indices + 2] - points[indices + 1]) / (points[indices + 1] - points[indices]))
         error = changes - expected
     error = np.hypot(error.real, (error.imag + np.pi) % (2 * np.pi) - np.pi)
     is_known = np.isfinite(error)
@@ -73,12 +73,12 @@ def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
 
 
 def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
-    """Return, for every three consecutive pictures that overlap, the number of the first and the logarithm of the
-    complex factor by which the movement changes."""
+    """Return, for every three consecutive pictures that overlap, the index of the first and the logarithm of the
+    complex factor by which the motion changes."""
     moves = [_measure_move(first, second) for first, second in pairwise(_describe_landmarks(paths))]
     changes = {
-        number: np.log(after[0] / before[0]) + before[1]
-        for number, (before, after) in enumerate(pairwise(moves))
+        index: np.log(after[0] / before[0]) + before[1]
+        for index, (before, after) in enumerate(pairwise(moves))
         if before and after and before[0] and after[0]
     }
     return np.array(list(changes), int), np.array(list(changes.values()), complex)

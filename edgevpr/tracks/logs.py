@@ -1,4 +1,4 @@
-"""Autopilot logs: ArduPilot DataFlash (.bin, .log), MAVLink telemetry (.tlog) and PX4 ULog (.ulg). Position and
+"""Reads autopilot logs: ArduPilot DataFlash (.bin, .log), MAVLink telemetry (.tlog) and PX4 ULog (.ulg). Position and
 attitude over time and, if the autopilot triggered the camera, for each picture."""
 
 import os
@@ -16,7 +16,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
 from edgevpr.tracks.record import Attitude, Record, make_tag, make_track, require_package
 
-_FIX_3D = 3  # lowest GPS status with which a position is used
+_FIX_3D = 3  # minimum GPS status for a position to be used
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
 _RECEIVERS = ("vehicle_gps_position", "sensor_gps")
 _PX4_TOPICS = (*_RECEIVERS, "vehicle_global_position", "vehicle_attitude", "vehicle_local_position", "camera_capture")
@@ -33,17 +33,17 @@ def read_ardupilot(path: Path) -> Record:
     lines: dict[str, list[tuple[float, GeoTag]]] = {"POS": [], "GPS": [], "CAM": [], "TRIG": []}
     attitude: Attitude | None = None
     for message in _read_messages(open_log, path, [*lines, "ATT"]):
-        kind = message.get_type()
-        if kind == "ATT":
+        msg_type = message.get_type()
+        if msg_type == "ATT":
             attitude = message.Yaw, message.Roll, message.Pitch
-        elif kind != "GPS" or message.Status >= _FIX_3D:
+        elif msg_type != "GPS" or message.Status >= _FIX_3D:
             height_m = getattr(message, "RelHomeAlt", getattr(message, "RelAlt", None))
             angles_deg = attitude
-            if kind in ("CAM", "TRIG"):  # older logs have long field names
+            if msg_type in ("CAM", "TRIG"):  # older logs have long field names
                 is_long = hasattr(message, "Yaw")
                 angles_deg = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
-            tag = make_tag(message.Lat, message.Lng, message.Alt, angles_deg, None if kind == "GPS" else height_m)
-            lines[kind].append((message._timestamp, tag))
+            tag = make_tag(message.Lat, message.Lng, message.Alt, angles_deg, None if msg_type == "GPS" else height_m)
+            lines[msg_type].append((message._timestamp, tag))
     shots = tuple(tag for _, tag in lines["CAM"] or lines["TRIG"])
     return Record(kind="ArduPilot log", track=make_track(path, lines["POS"] or lines["GPS"]), shots=shots)
 
@@ -53,17 +53,17 @@ def read_telemetry(path: Path) -> Record:
     that reports a position. Times are from the ground station's clock."""
     from pymavlink import mavutil
 
-    kinds = ["GLOBAL_POSITION_INT", "ATTITUDE", "CAMERA_FEEDBACK"]
+    types = ["GLOBAL_POSITION_INT", "ATTITUDE", "CAMERA_FEEDBACK"]
     lines, shots, vehicle, attitude = [], [], None, None
-    for message in _read_messages(mavutil.mavlink_connection, path, kinds):
-        kind, sender = message.get_type(), message.get_srcSystem()
-        if kind == "GLOBAL_POSITION_INT":
+    for message in _read_messages(mavutil.mavlink_connection, path, types):
+        msg_type, sender = message.get_type(), message.get_srcSystem()
+        if msg_type == "GLOBAL_POSITION_INT":
             vehicle = sender if vehicle is None else vehicle
         if vehicle not in (None, sender):
             continue
-        if kind == "ATTITUDE":
+        if msg_type == "ATTITUDE":
             attitude = degrees(message.yaw), degrees(message.roll), degrees(message.pitch)
-        elif kind == "CAMERA_FEEDBACK":
+        elif msg_type == "CAMERA_FEEDBACK":
             angles = message.yaw, message.roll, message.pitch
             shots.append(make_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, angles, message.alt_rel))
         else:
@@ -75,17 +75,17 @@ def read_telemetry(path: Path) -> Record:
     return Record(kind="telemetry log", track=make_track(path, lines), shots=tuple(shots))
 
 
-def _read_messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> list[Any]:
-    """Return the messages of these types up to the end of a log or up to the first damage."""
-    os.environ["PYMAVLINK_FAST_INDEX"] = "0"  # the compiled index prints every byte that it skips, bypassing sys.stdout
+def _read_messages(open_log: Callable[[str], Any], path: Path, types: list[str]) -> list[Any]:
+    """Return the messages of these types, up to the end of a log or the first damaged message."""
+    os.environ["PYMAVLINK_FAST_INDEX"] = "0"  # the compiled index prints every skipped byte, bypassing sys.stdout
     messages = []
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # pymavlink prints what it skips
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # pymavlink prints the bytes that it skips
         try:
             log = open_log(str(path))
         except Exception as error:  # malformed files can raise anything
             raise UsageError(f"{path} cannot be read as a log ({error}): copy it from the autopilot again.") from error
         with suppress(Exception):  # read up to a truncated or damaged message
-            while message := log.recv_match(type=kinds):
+            while message := log.recv_match(type=types):
                 messages.append(message)
         with suppress(AttributeError):  # a text log has no close()
             log.close()
@@ -93,7 +93,7 @@ def _read_messages(open_log: Callable[[str], Any], path: Path, kinds: list[str])
 
 
 def read_px4(path: Path) -> Record:
-    """Read a PX4 log: estimated position, height above the start, attitude, and `camera_capture`."""
+    """Read a PX4 log: estimated position, height above the starting point, attitude, and `camera_capture`."""
     require_package("pyulog", "pyulog", "A PX4 log")
     from pyulog import ULog
 
@@ -102,7 +102,7 @@ def read_px4(path: Path) -> Record:
             datasets = ULog(file, list(_PX4_TOPICS), disable_str_exceptions=True).data_list
     except Exception as error:  # malformed files can raise anything
         raise UsageError(f"{path} cannot be read as a PX4 log ({error}): copy it from the autopilot again.") from error
-    data = {topic.name: topic.data for topic in reversed(datasets) if len(topic.data["timestamp"])}  # the first of each
+    data = {topic.name: topic.data for topic in reversed(datasets) if len(topic.data["timestamp"])}  # first instance
     shots = tuple(tag for _, tag in _read_positions(data, "camera_capture"))
     return Record(kind="PX4 log", track=make_track(path, _read_positions(data, "vehicle_global_position")), shots=shots)
 
@@ -124,7 +124,7 @@ def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
 
 
 def _read_utc_offset_s(data: Topics) -> float:
-    """Return the offset from seconds since autopilot start to seconds since 1970; 0 if no receiver knows the time."""
+    """Return the offset from seconds since autopilot boot to seconds since 1970; 0 if no receiver knew the time."""
     for receiver in filter(None, map(data.get, _RECEIVERS)):
         if (has_time := receiver["time_utc_usec"] > 0).any():
             utc_us = receiver["time_utc_usec"][has_time].astype(np.float64)
@@ -133,7 +133,7 @@ def _read_utc_offset_s(data: Topics) -> float:
 
 
 def _interpolate_attitudes(attitude: dict[str, Array], times_us: Array) -> list[Attitude]:
-    """Return the yaw, roll and pitch last reported before each time, in degrees."""
+    """Return the last reported yaw, roll and pitch before each time, in degrees."""
     indices = np.clip(np.searchsorted(attitude["timestamp"], times_us, side="right") - 1, 0, None)
     w, x, y, z = (attitude[f"q[{axis}]"][indices].astype(float) for axis in range(4))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

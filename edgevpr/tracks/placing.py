@@ -19,17 +19,17 @@ from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import Record
 
 _ZONE_STEP_S = 900  # time zones are multiples of a quarter of an hour
-_MAX_ZONE_STEPS = 4 * 14  # and at most 14 hours
+_MAX_ZONE_STEPS = 4 * 14  # UTC offsets are at most 14 hours
 _MAX_COMPARED = 200  # pictures compared to estimate the clock offset
-_MIN_SHARE_IN_TRACK = 0.5  # of the pictures that must lie within the track
+_MIN_FRACTION_IN_TRACK = 0.5  # minimum fraction of the pictures that must lie within the track
 _ROUNDING_DEG = 1e-4  # as in subtitles with four decimals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
-    """`how`: how pictures were assigned, in words. `pictures`: number of pictures in the folder. `tags`: position and
-    attitude by name of those that were placed; empty for a video. `track`: track of a video, in video time. `offset_s`:
-    seconds added to the camera's clock (None: no clock was needed)."""
+    """The positions assigned to pictures. `how`: how they were assigned, in words. `pictures`: number of pictures in
+    the folder. `tags`: position and attitude of each placed picture by name; empty for a video. `track`: track of a
+    video, in video time. `offset_s`: seconds added to the camera's clock (None: no clock was needed)."""
 
     how: str
     tags: Mapping[str, GeoTag] = field(default_factory=dict)
@@ -39,40 +39,41 @@ class Placement:
 
 
 def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Placement:
-    """Place the pictures of a folder. `offset_s`: seconds to add to the camera's clock (None: estimated). Values that
+    """Place the pictures of a folder. `offset_s`: seconds to add to the camera's clock (None: estimate). Values that
     the record lacks are taken from the EXIF data. Raises UsageError if pictures and record do not belong together."""
     paths = list_images(folder)
     exif_tags = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
-    if record.named:
-        matched, how = _match_names(record.named, list(exif_tags)), "by their names"
+    if record.tags_by_name:
+        tags, how = _match_names(record.tags_by_name, list(exif_tags)), "by name"
     elif len(record.shots) == len(exif_tags):
-        matched, how = dict(zip(exif_tags, record.shots, strict=True)), "in the order of the autopilot's pictures"
+        tags, how = dict(zip(exif_tags, record.shots, strict=True)), "in the order of the autopilot's camera triggers"
     elif record.track and record.is_utc:
         return _match_times(record.track, folder, exif_tags, offset_s)
     elif record.shots:
         raise UsageError(
-            f"{len(record.shots)} images were triggered, but {folder} contains {len(exif_tags)}: keep only those in it."
+            f"The camera was triggered {len(record.shots)} times, but {folder} contains {len(exif_tags)} images: keep "
+            "only the triggered ones."
         )
     else:
-        raise UsageError(f"These positions ({record.kind}) belong to a video: give that video as --images.")
-    if not matched:
-        raise UsageError(f"The {record.kind} lists none of the images in {folder}: give the folder of its images.")
-    tags = {name: _fill_tag(tag, exif_tags[name]) for name, tag in matched.items()}
+        raise UsageError(f"These positions ({record.kind}) belong to a video: pass that video as --images.")
+    if not tags:
+        raise UsageError(f"The {record.kind} lists none of the images in {folder}: pass the folder of its images.")
+    tags = {name: _fill_tag(tag, exif_tags[name]) for name, tag in tags.items()}
     return Placement(how=how, tags=tags, pictures=len(exif_tags))
 
 
-def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
+def _match_names(tags: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
     """Match pictures by full name or else by name without extension, ignoring case."""
-    tags_by_name = {name.casefold(): tag for name, tag in named.items()}
-    tags_by_stem = {Path(name).stem.casefold(): tag for name, tag in named.items()}
-    tags = {name: tags_by_name.get(name.casefold(), tags_by_stem.get(Path(name).stem.casefold())) for name in names}
-    return {name: tag for name, tag in tags.items() if tag and tag.position}
+    tags_by_name = {name.casefold(): tag for name, tag in tags.items()}
+    tags_by_stem = {Path(name).stem.casefold(): tag for name, tag in tags.items()}
+    matches = {name: tags_by_name.get(name.casefold(), tags_by_stem.get(Path(name).stem.casefold())) for name in names}
+    return {name: tag for name, tag in matches.items() if tag and tag.position}
 
 
 def _match_times(track: Track, folder: Path, exif_tags: Mapping[str, GeoTag], offset_s: float | None) -> Placement:
     times = {name: tag.t_utc_s for name, tag in exif_tags.items() if tag.t_utc_s is not None}
     if not times:
-        raise UsageError("The images have no times (EXIF DateTimeOriginal): give the camera's original files.")
+        raise UsageError("The images have no times (EXIF DateTimeOriginal): use the camera's original files.")
     how, times_s = "by time", np.array(list(times.values()))
     if offset_s is None:
         offset_s = _estimate_zone_offset_s(track, times_s, "the pictures")
@@ -80,7 +81,7 @@ def _match_times(track: Track, folder: Path, exif_tags: Mapping[str, GeoTag], of
         paths = progress([folder / name for name in earliest], len(earliest), "comparing pictures")
         fine_s = estimate_clock_offset_s(track, [times[name] + offset_s for name in earliest], paths)
         offset_s += fine_s or 0.0
-        how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
+        how += ", camera clock corrected by " + ("time zone" if fine_s is None else "the motion between pictures")
     times = {name: t_s + offset_s for name, t_s in times.items()}
     interpolated = {name: replace(track.interpolate_tag(t_s), t_utc_s=t_s) for name, t_s in times.items()}
     tags = {name: _fill_tag(tag, exif_tags[name]) for name, tag in interpolated.items() if tag.position}
@@ -96,40 +97,40 @@ def _fill_tag(tag: GeoTag, fallback: GeoTag) -> GeoTag:
 
 
 def place_video(record: Record, video: Path, offset_s: float | None) -> Placement:
-    """Place the frames of a video. `offset_s`: seconds to add to the camera's clock (None: estimated), or to the video
+    """Place the frames of a video. `offset_s`: seconds to add to the camera's clock (None: estimate), or to the video
     time if the record is in video time. Raises UsageError if video and record do not belong together."""
     if record.track is None:
-        raise UsageError(f"These positions ({record.kind}) have no times, but a video needs them: give a log or track.")
-    began_s, lasts_s = read_start_s(video)
+        raise UsageError(f"These positions ({record.kind}) have no times, but a video needs them: use a log or track.")
+    start_s, duration_s = read_start_s(video)
     if record.is_utc:
-        if began_s is None:
-            raise UsageError(f"{video} has no start time: give a flight log that covers the time of the video.")
+        if start_s is None:
+            raise UsageError(f"{video} has no start time: use a recording with video times.")
         if offset_s is None:
-            offset_s = _estimate_zone_offset_s(record.track, np.linspace(began_s, began_s + lasts_s, 60), str(video))
-        shift_s, how = -began_s - offset_s, "by time"
+            offset_s = _estimate_zone_offset_s(record.track, np.linspace(start_s, start_s + duration_s, 60), str(video))
+        shift_s, how = -start_s - offset_s, "by time"
     else:
-        shift_s, how = -(offset_s or 0.0), "by the time of the video"
+        shift_s, how = -(offset_s or 0.0), "by video time"
     track = replace(record.track, t_s=tuple((np.array(record.track.t_s) + shift_s).tolist()))
-    if lasts_s:
-        track.require_overlap(video, lasts_s)
+    if duration_s:
+        track.require_overlap(video, duration_s)
     return Placement(how=how, track=track, offset_s=offset_s)
 
 
 def _estimate_zone_offset_s(track: Track, times_s: Doubles, label: str) -> float:
-    """Estimate the offset to add to a camera clock set to local time so that most of its times, float (N,), fall within
-    the track: whole hours, else half hours, else quarters."""
+    """Estimate the time-zone offset to add to a camera clock so that most of its times, float (N,), fall within the
+    track: in whole hours, else half hours, else quarter hours."""
     offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * _ZONE_STEP_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
     shifted_s = times_s + offsets_s[:, None]
-    shares = ((shifted_s >= first_s) & (shifted_s <= last_s)).mean(axis=1)
-    if shares.max() < _MIN_SHARE_IN_TRACK:
-        raise UsageError(f"In no time zone does the track cover {label}: {_format_spans(track, times_s)}")
-    fitting_s = offsets_s[shares == shares.max()].tolist()
+    fractions = ((shifted_s >= first_s) & (shifted_s <= last_s)).mean(axis=1)
+    if fractions.max() < _MIN_FRACTION_IN_TRACK:
+        raise UsageError(f"The track does not cover {label} in any time zone: {_format_spans(track, times_s)}")
+    best_s = offsets_s[fractions == fractions.max()].tolist()
     for unit_s in (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S):
-        candidates_s = sorted((offset_s for offset_s in fitting_s if offset_s % unit_s == 0), key=abs)
+        candidates_s = sorted((offset_s for offset_s in best_s if offset_s % unit_s == 0), key=abs)
         if len(candidates_s) > 1:
             choices = ", ".join(f"{offset_s:g}" for offset_s in candidates_s[:4])
-            raise UsageError(f"The camera's clock may be {choices} s off: pass one as --offset-s (0 if it is right).")
+            raise UsageError(f"The camera's clock may be off by {choices} s: pass one as --offset-s (0 if right).")
         if candidates_s:
             return float(candidates_s[0])
     raise AssertionError("the smallest unit fits")
@@ -138,14 +139,14 @@ def _estimate_zone_offset_s(track: Track, times_s: Doubles, label: str) -> float
 def _format_spans(track: Track, times_s: Doubles) -> str:
     """Return the time spans of camera and track as text, with advice."""
     ends_s = np.array([times_s.min(), times_s.max(), track.t_s[0], track.t_s[-1]])
-    return "the camera's clock gives {} to {}, the track lasts from {} to {} (UTC): give --offset-s.".format(
+    return "the camera's clock ran from {} to {}, the track is from {} to {} (UTC): pass --offset-s.".format(
         *ends_s.astype("datetime64[s]").astype(str)
     )
 
 
-def find_rounding_m(placed: Placement) -> float | None:
+def find_rounding_m(placement: Placement) -> float | None:
     """Return the rounding step of all positions in metres if it is coarse, otherwise None."""
-    tags = placed.track.tags if placed.track else placed.tags.values()
-    parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDING_DEG
-    is_rounded = np.allclose(parts, np.round(parts), rtol=0, atol=1e-4)
+    tags = placement.track.tags if placement.track else placement.tags.values()
+    steps = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDING_DEG
+    is_rounded = np.allclose(steps, np.round(steps), rtol=0, atol=1e-4)
     return float(np.radians(_ROUNDING_DEG)) * EARTH_RADIUS_M if is_rounded else None

@@ -1,4 +1,4 @@
-"""Recordings of where an aircraft was: autopilot logs, subtitles of drone videos, receiver tracks, and tables of other
+"""Recordings of an aircraft's path: autopilot logs, subtitles of drone videos, receiver tracks, and tables from other
 programs. `read_record` detects the type of a file."""
 
 from collections.abc import Callable, Iterable, Mapping
@@ -9,7 +9,7 @@ from pathlib import Path
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import ALT_LIMITS_M, GeoTag, Track, make_position
 
-_MIN_INTERVAL_S = 1.0  # while nothing moves, a track keeps one line per second
+_MIN_INTERVAL_S = 1.0  # a track keeps one line per second while the position does not change
 Attitude = tuple[float | None, float | None, float | None]  # heading, roll and pitch, degrees
 _UNKNOWN: Attitude = (None, None, None)
 
@@ -18,25 +18,25 @@ _UNKNOWN: Attitude = (None, None, None)
 class Record:
     """Content of a recording.
 
-    `kind`: type of recording, in words. `track`: position and attitude over time (None: it has no times). `is_utc`: the
+    `kind`: type of recording, in words. `track`: position and attitude over time (None: no times). `is_utc`: the
     times of the track are seconds since 1970; otherwise seconds from the first frame of the video that it belongs to.
-    `shots`: what the autopilot logged for each picture that it triggered, in order. `named`: position and attitude by
-    picture name, from a table that names pictures."""
+    `shots`: what the autopilot logged for each picture that it triggered, in order. `tags_by_name`: position and
+    attitude by picture name, from a table that names pictures."""
 
     kind: str
     track: Track | None = None
     is_utc: bool = True
     shots: tuple[GeoTag, ...] = ()
-    named: Mapping[str, GeoTag] = field(default_factory=dict)
+    tags_by_name: Mapping[str, GeoTag] = field(default_factory=dict)
 
 
 def read_record(path: Path) -> Record:
-    """Read a recording. Its type follows from its extension: .bin, .log, .tlog, .ulg, .srt, .gpx or .jsonl; any other
+    """Read a recording. The extension determines its type: .bin, .log, .tlog, .ulg, .srt, .gpx or .jsonl; any other
     file is a table. Raises UsageError for a file that cannot be read or has no position."""
-    from edgevpr.tracks import flown, gpx, logs, srt, tables
+    from edgevpr.tracks import edgevpr_logs, gpx, logs, srt, tables
 
     if not path.is_file():
-        raise UsageError(f"{path} does not exist: give a log, a track, subtitles or a table.")
+        raise UsageError(f"{path} does not exist: choose a log, a track, subtitles or a table.")
     readers: dict[str, Callable[[Path], Record]] = {
         ".bin": logs.read_ardupilot,
         ".log": logs.read_ardupilot,
@@ -44,10 +44,10 @@ def read_record(path: Path) -> Record:
         ".ulg": logs.read_px4,
         ".srt": srt.read_subtitles,
         ".gpx": gpx.read_gpx,
-        ".jsonl": flown.read_flight,
+        ".jsonl": edgevpr_logs.read_flight,
     }
     record = readers.get(path.suffix.lower(), tables.read_table)(path)
-    if not (record.track or record.shots or record.named):
+    if not (record.track or record.shots or record.tags_by_name):
         raise UsageError(f"{path} ({record.kind}) has no position: did the receiver have a GPS fix?")
     return record
 
@@ -77,13 +77,13 @@ def make_tag(
 
 def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
     """Make a track from times and tags in any order; None if no tag has a position. Of lines that repeat a position, as
-    subtitles do for each frame, one per second is kept: positions between two lines are interpolated."""
-    kept: dict[float, GeoTag] = {}
+    subtitles do for each frame, one per second is kept, because positions between two lines are interpolated."""
+    tags: dict[float, GeoTag] = {}
     previous_s, previous = float("-inf"), GeoTag()
     for t_s, tag in sorted(lines, key=lambda line: line[0]):
         if tag.position and (tag.position != previous.position or t_s - previous_s >= _MIN_INTERVAL_S):
-            kept[t_s], previous_s, previous = tag, t_s, tag
-    return Track(path, tuple(kept), tuple(kept.values())) if kept else None
+            tags[t_s], previous_s, previous = tag, t_s, tag
+    return Track(path, tuple(tags), tuple(tags.values())) if tags else None
 
 
 def require_package(module: str, package: str, what: str) -> None:

@@ -1,5 +1,5 @@
-"""Subtitles (.srt) that DJI drones write beside a video: position, height and gimbal angles of each frame or second, in
-formats that depend on the model. Times are video times, so no clock is involved."""
+"""Reads the subtitles (.srt) that DJI drones write for a video: position, height and gimbal angles of each frame or
+second, in formats that depend on the model. Times are video times, so no clock is involved."""
 
 import re
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ def read_subtitles(path: Path) -> Record:
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise UsageError(f"{path} cannot be read ({error.strerror}): give the subtitles beside the video.") from error
+        raise UsageError(f"{path} cannot be read ({error.strerror}): pass the .SRT file next to the video.") from error
     track = make_track(path, _read_blocks(text))
     return Record(kind="subtitles of a video", track=track, is_utc=False)
 
@@ -37,27 +37,27 @@ def _read_blocks(text: str) -> Iterator[tuple[float, GeoTag]]:
     """Yield the video time of each subtitle, in seconds, and its tag."""
     starts = list(_START_TIME.finditer(text))
     ends = [start.start() for start in starts[1:]] + [len(text)]
-    for start, end in zip(starts, ends, strict=False):  # an empty file has one end too many
+    for start, end in zip(starts, ends, strict=False):  # if the file is empty, `ends` has one element too many
         hours, minutes, seconds, fraction = start.groups()
         t_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
         yield t_s, _parse_block(text[start.end() : end])
 
 
 def _parse_block(block: str) -> GeoTag:
-    named = {name.lower(): float(number) for name, number in _NAMED_VALUE.findall(block)}
-    lat_deg, height_m = named.get("lat", named.get("latitude")), named.get("rel_alt")
-    lon_deg = named.get("lon", named.get("longitude", named.get("longtitude")))
+    values = {name.lower(): float(number) for name, number in _NAMED_VALUE.findall(block)}
+    lat_deg, height_m = values.get("lat", values.get("latitude")), values.get("rel_alt")
+    lon_deg = values.get("lon", values.get("longitude", values.get("longtitude")))
     if gps := _GPS.search(block):
         lon_deg, lat_deg = float(gps[1]), float(gps[2])  # the third is an altitude, or the number of satellites
         if gps[4] or abs(lat_deg) > 90:  # formats with the altitude in M have the latitude first
             lon_deg, lat_deg = lat_deg, lon_deg
     if height_m is None and (height := _HEIGHT.search(block)):
         height_m = float(height[1])
-    attitude: Attitude = (named.get("drone_yaw", named.get("yaw")), None, None)
-    gimbal = [named[name] for name in ("gb_pitch", "gb_roll", "gb_yaw") if name in named]
+    attitude: Attitude = (values.get("drone_yaw", values.get("yaw")), None, None)
+    gimbal = [values[name] for name in ("gb_pitch", "gb_roll", "gb_yaw") if name in values]
     if match := _GIMBAL.search(block):
         gimbal = list(map(float, match.groups()))
     if len(gimbal) == 3 and any(gimbal):
         pitch, roll, yaw = gimbal
         attitude = to_nadir_angles(yaw, pitch, roll)
-    return make_tag(lat_deg, lon_deg, named.get("abs_alt", named.get("altitude")), attitude, height_m)
+    return make_tag(lat_deg, lon_deg, values.get("abs_alt", values.get("altitude")), attitude, height_m)

@@ -18,7 +18,7 @@ from edgevpr.tracks.record import Attitude, Record, make_tag
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _MAX_HEADER_ROWS = 10  # rows that are searched for the column names
-# Column names, reduced to letters; the first one present is used.
+# Column names, reduced to letters; the first one that is present is used.
 _COLUMN_NAMES = {
     "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
     "lat": ("latitude", "lat", "gpslatitude", "ylatitude"),
@@ -55,35 +55,36 @@ def read_table(path: Path) -> Record:
         if not _WGS84.match(lines[0]):
             raise UsageError(f"{path} uses `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
         lines, default_columns = lines[1:], _OPENDRONEMAP_COLUMNS
-    for separator, divider in _SEPARATORS.items():
+    for separator, separator_name in _SEPARATORS.items():
         rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
         if layout := _find_columns(rows):
             columns, first, names = layout
         elif (
             rows and len(rows[0]) >= len(_REQUIRED_COLUMNS) and is_image(rows[0][0].strip())
-        ):  # without names: the usual order
+        ):  # no names: the usual order
             columns, first, names = {part: column for column, part in enumerate(default_columns)}, 0, default_columns
         else:
             continue
-        needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
-        return Record(kind=f"table of {needed}, separated by {divider}", named=_read_rows(rows[first:], columns, path))
-    raise UsageError(f"{path}: no columns for image, latitude and longitude: in line 1, call them file, lat and lon.")
+        used = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
+        tags = _read_rows(rows[first:], columns, path)
+        return Record(kind=f"table of {used}, separated by {separator_name}", tags_by_name=tags)
+    raise UsageError(f"{path}: no columns for image, latitude and longitude: name them file, lat and lon in line 1.")
 
 
 def _find_columns(rows: Rows) -> Layout | None:
     """Find the row with the column names."""
-    for number, row in enumerate(rows[:_MAX_HEADER_ROWS]):
+    for index, row in enumerate(rows[:_MAX_HEADER_ROWS]):
         names = [_NON_LETTERS.sub("", cell.lower()) for cell in row]
-        numbers = {part: _find_column(choices, names) for part, choices in _COLUMN_NAMES.items()}
-        columns = {part: column for part, column in numbers.items() if column is not None}
+        indices = {part: _find_column(part_names, names) for part, part_names in _COLUMN_NAMES.items()}
+        columns = {part: column for part, column in indices.items() if column is not None}
         is_split = not any(separator in cell for cell in row for separator in ",;\t")
         if is_split and columns.keys() >= set(_REQUIRED_COLUMNS):
-            return columns, number + 1, row
+            return columns, index + 1, row
     return None
 
 
 def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
-    """Return the column of the first of `choices`, else of an angle's name that ends with it (`vehicle latitude`)."""
+    """Return the column of the first of `choices`, else of an angle whose name ends with it (`vehicle latitude`)."""
     exact = [names.index(name) for name in choices if name in names]
     is_angle = choices[0] in ("latitude", "longitude")
     angles = [column for column, name in enumerate(names) if is_angle and name.endswith(choices[0])]
@@ -91,25 +92,25 @@ def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
 
 
 def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, GeoTag]:
-    named = {}
+    tags = {}
     for row in rows:
         cells = {part: row[column].strip() for part, column in columns.items() if column < len(row)}
         try:
-            named[PureWindowsPath(cells["file"]).name] = _parse_row(cells)
+            tags[PureWindowsPath(cells["file"]).name] = _parse_row(cells)
         except (KeyError, ValueError) as error:
-            raise UsageError(f"{path}: `{' '.join(row):.80}` is invalid ({error}): correct the line.") from error
-    if named and not any(tag.position for tag in named.values()):
+            raise UsageError(f"{path}: `{' '.join(row):.80}` is invalid ({error}): correct this line.") from error
+    if tags and not any(tag.position for tag in tags.values()):
         raise UsageError(f"{path} has no valid position: are latitude and longitude swapped, or not in degrees?")
-    return named
+    return tags
 
 
 def _parse_row(cells: Mapping[str, str]) -> GeoTag:
-    """Make a tag from a row's cells; an impossible position becomes unknown. Raises ValueError for a non-number."""
-    number = {part: _parse_angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
-    attitude: Attitude = (number.get("nose"), None, None)
-    if {"yaw", "pitch", "roll"} <= number.keys():
-        attitude = to_nadir_angles(number["yaw"], number["pitch"], number["roll"])
-    tag = make_tag(number.get("lat"), number.get("lon"), number.get("alt"), attitude, number.get("height"))
+    """Make a tag from a row's cells; an impossible position becomes unknown. Raises ValueError for other text."""
+    values = {part: _parse_angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
+    attitude: Attitude = (values.get("nose"), None, None)
+    if {"yaw", "pitch", "roll"} <= values.keys():
+        attitude = to_nadir_angles(values["yaw"], values["pitch"], values["roll"])
+    tag = make_tag(values.get("lat"), values.get("lon"), values.get("alt"), attitude, values.get("height"))
     with suppress(KeyError, ValueError, OverflowError):  # no time, or an unreadable one
         return replace(tag, t_utc_s=parse_time(cells["time"]))
     return tag
@@ -120,6 +121,6 @@ def _parse_angle(text: str) -> float:
     numbers = _NUMBERS.findall(text)
     if not 1 <= len(numbers) <= 3:
         raise ValueError(f"{text} is not a number")
-    value: float = sum(abs(float(part.replace(",", "."))) / 60**place for place, part in enumerate(numbers))
+    value: float = sum(abs(float(part.replace(",", "."))) / 60**power for power, part in enumerate(numbers))
     is_negative = numbers[0].startswith("-") or text.rstrip().upper().endswith(("S", "W", "BELOW SEA LEVEL"))
     return -value if is_negative else value

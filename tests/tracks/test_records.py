@@ -137,7 +137,7 @@ def test_subtitles_of_each_form_are_read(tmp_path, form):
 def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expected):
     (tmp_path / "table.csv").write_text(text)
     record = read_record(tmp_path / "table.csv")
-    at = record.named["a.JPG"].position
+    at = record.tags_by_name["a.JPG"].position
     assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
     assert "separated by" in record.kind
 
