@@ -1,7 +1,7 @@
 """Board profiles: hardware, power, and the resources that edgevpr may use. Each is a YAML file in `profiles/`. This
 module also detects the board that it runs on. The flight, `edgevpr profile` and `edgevpr service` use it.
 
-`root`: root of the file system with /proc and /sys, which tests replace by another tree.
+`root`: root of the file system with /proc and /sys; tests pass another tree.
 """
 
 from dataclasses import dataclass, replace
@@ -44,9 +44,9 @@ class Board:
     `rate_hz`: queries per second unless the user sets a rate.
     `cpu_share` (of all cores), `budget_mb` (map index), `memory_max_mb` (whole process): limits of what edgevpr uses.
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
-    `technique`: default technique if it fits in the budget (None: the best that fits).
+    `technique`: default technique, if it fits the budget (None: the best that fits).
     `threads`: number of threads that a network may use.
-    `recognised_by`: a machine is this board if its model name in device tree or firmware contains this text (None:
+    `recognised_by`: text in the model name (device tree or firmware) of a machine that is this board (None:
     never).
     """
 
@@ -93,7 +93,7 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
 
 
 def resolve_board(board: Board, source: SourceConfig, memory: MemoryConfig) -> Board:
-    """Return the board with its query rate and index memory replaced by the configured ones, if any."""
+    """Return the board with its query rate and index memory replaced by configured values, if any."""
     return replace(board, rate_hz=source.rate_hz or board.rate_hz, budget_mb=memory.budget_mb or board.budget_mb)
 
 
@@ -124,17 +124,17 @@ def _read_board(path: Path) -> Board:
 def _detect_board(root: Path) -> Board:
     """Return the profile of this machine's board, or else generic-x86, with the cores and memory of this machine."""
     model = machine.read_model(root)
-    recognised = next(
+    detected = next(
         (board for board in map(_read_shipped_board, list_boards() if model else ()) if _is_model_of(board, root)), None
     )
-    profile = recognised or _read_shipped_board(_FALLBACK_BOARD)
+    profile = detected or _read_shipped_board(_FALLBACK_BOARD)
     title = profile.title
-    if model and not recognised:
-        title = f"{model}, which has no profile: using the figures of {_FALLBACK_BOARD}"
+    if model and not detected:
+        title = f"{model} has no profile, using the figures of {_FALLBACK_BOARD}"
     ram_mb = machine.read_ram_mb(root)
-    # Scale the profile's memory limits to the machine's real memory; a control group may allow less.
+    # Scale the profile's memory limits to the machine's real memory; a cgroup may allow less.
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.read_ram_limit_mb(root))
-    # The power model counts all cores of the machine, so a CPU quota reduces `cpu_share` and not the number of cores.
+    # The power model counts all cores of the machine, so a CPU quota reduces `cpu_share` instead of `cores`.
     cores = machine.count_cores_online(root)
     cpu_share = min(profile.cpu_share, machine.count_usable_cores(root) / cores)
     return replace(

@@ -1,6 +1,6 @@
-"""Power model of chapter 5 of the thesis, and the charge that it draws from the battery pack. Plain arithmetic.
+"""Power model of chapter 5 of the thesis, and the resulting charge drawn from the battery pack. Plain arithmetic.
 
-Symbols of the thesis: U, utilisation of the whole machine (0..1); a, idle power; s, power that full load adds; P,
+Symbols of the thesis: U, utilisation of the whole machine (0..1); a, idle power; s, power added at full load; P,
 power; t, time; indices e, m and q for encoding, matching and a whole query. Equation 5.3, P_q = P_e + P_m, is omitted:
 encoding and matching run one after the other, so their powers do not add up. Their energies do, as in equation 5.6.
 """
@@ -34,8 +34,8 @@ def parse_pack(text: str) -> Pack:
         if 1 <= pack.cells <= 24 and pack.capacity_mah >= 1:
             return pack
     raise ConfigError(
-        f"The battery pack `{text}` is invalid: write its cells in series (1 to 24), S and its capacity in mAh "
-        "(1 to 999999), as in 4S5200."
+        f"The battery pack is `{text}`, but must be the number of cells in series (1 to 24), S and the capacity in mAh "
+        "(1 to 999999), such as 4S5200."
     )
 
 
@@ -48,13 +48,13 @@ def stage_energy_j(idle_w: float, full_w: float, utilisation: float, t_s: float)
 
 
 def marginal_energy_j(idle_w: float, full_w: float, utilisation: float, t_s: float) -> float:
-    """Return the energy in joules that a stage of `t_s` seconds adds to that of the idle board: s U t."""
+    """Return the energy in joules that a stage of `t_s` seconds adds to the energy of the idle board: s U t."""
     return (full_w - idle_w) * utilisation * t_s
 
 
 def pack_ah(energy_j: float, pack: Pack, regulator_efficiency: float) -> float:
     """Return the ampere-hours drawn from the pack, by equation 5.6 with the pack's voltage: Ah = P t / (V_pack x
-    regulator efficiency). The thesis uses the CPU's 2.5 V rail instead. The efficiency is a share, 0..1."""
+    regulator efficiency). The thesis uses the CPU's 2.5 V rail instead. The efficiency is from 0 to 1."""
     return energy_j / (pack.nominal_v * regulator_efficiency * _S_PER_H)
 
 

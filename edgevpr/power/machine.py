@@ -1,7 +1,7 @@
 """Hardware of this machine and memory of this process, as the kernel reports them in /proc and /sys.
 
-Board profiles, query meters and technique trials use it. `root`: root of the file system, which tests replace by
-another tree. A megabyte (MB) is 10^6 bytes.
+Board profiles, query meters and technique trials use it. `root`: root of the file system; tests pass another tree. A
+megabyte (MB) is 10^6 bytes.
 """
 
 import os
@@ -28,7 +28,7 @@ def count_cores_online(root: Path = _ROOT) -> int:
 
 
 def count_usable_cores(root: Path = _ROOT) -> float:
-    """Return how many cores this process may use according to CPU affinity and the quotas (cpu.max) of its cgroups."""
+    """Return the number of cores that CPU affinity and cgroup quotas (cpu.max) allow this process to use."""
     quotas = (int(quota_us) / int(period_us) for quota_us, period_us in _read_cgroup_limits("cpu.max", root))
     return min([float(len(os.sched_getaffinity(0))), *quotas])
 
@@ -46,7 +46,7 @@ def read_ram_limit_mb(root: Path = _ROOT) -> float:
 
 def read_rss_mb(root: Path = _ROOT) -> float:
     """Return the resident memory (RSS) of this process in MB, including pages that it shares with other processes."""
-    # Called twice per query: `read_text` would take three times as long.
+    # Called twice per query; `read_text` would take three times as long.
     with open(f"{root}/proc/self/statm", "rb", buffering=0) as statm:
         resident_pages = int(statm.read(256).split()[1])
     return resident_pages * _PAGE_BYTES / 1e6
@@ -65,7 +65,7 @@ def read_peak_mb(root: Path = _ROOT) -> float:
 
 
 def read_text(path: Path) -> str | None:
-    """Read a small file, stripped of zero bytes, line ends and blanks; None if it cannot be read."""
+    """Read a small file and strip zero bytes, line ends and blanks; None if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip("\0\n ")
     except OSError:

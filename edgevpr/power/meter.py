@@ -1,5 +1,5 @@
 """Metering of queries: wall and CPU seconds, utilisation and charge of each query, and the totals of a flight. Also the
-machine's CPU load and memory, for autopilot and ground station.
+machine's CPU load and memory, to report to autopilot and ground station.
 
 Energies add up, powers do not (see `equations`, which explains a, s and U). The idle energy a T of a flight of T
 seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, whatever the order of the stages."""
@@ -18,19 +18,19 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack, stage_energy_j
 
 Clock = Callable[[], float]
-_MIN_WAITING_SHARE = 0.15  # of working time; a thread that is off the CPU for longer was kept waiting by other programs
+_MIN_WAIT_FRACTION = 0.15  # of working time; other programs delayed a thread that was off the CPU for longer
 
 
 @dataclass(slots=True)
 class Stage:
-    """A metered stage. `cost` is set when the stage ends, unless a signal interrupts at that moment."""
+    """A metered stage. `cost` is set when the stage ends, unless a signal interrupts it at that moment."""
 
     cost: StageCost = NO_COST
 
 
 @contextmanager
 def meter_stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
-    """Meter a block of code: `with meter_stage() as encoding: ...`, then read `encoding.cost`. The CPU time is that of
+    """Meter a block of code: `with meter_stage() as encoding: ...`, then read `encoding.cost`. The CPU time includes
     all threads."""
     stage = Stage()
     wall_s, cpu_s = wall_clock(), cpu_clock()
@@ -41,7 +41,7 @@ def meter_stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.p
 
 
 class QueryMeter:
-    """Measures the steps of one query after another, and the charge that each query draws from the `battery` (None: a
+    """Measures the steps of queries, one after the other, and the charge that each draws from the `battery` (None: a
     default, if only times are needed). `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` the
     resident memory of this process."""
 
@@ -115,7 +115,7 @@ def compute_query_cost(
 
 
 class FlightEnergy:
-    """Sums the stages of a flight from the creation of this object: `marginal_j` is the energy that they added, in
+    """Sums the stages of a flight since the creation of this object: `marginal_j` is the energy that they added, in
     joules at the board's input. `cpu_clock` counts all threads."""
 
     def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
@@ -136,8 +136,8 @@ class FlightEnergy:
 
 @dataclass(frozen=True, slots=True)
 class MachineLoad:
-    """Load of the machine: the busy share of each core, 0..1, since the last call of `measure_machine_load`, and RAM in
-    bytes."""
+    """Load of the machine: the utilisation of each core, 0..1, since the last call of `measure_machine_load`, and RAM
+    in bytes."""
 
     core_shares: tuple[float, ...]
     ram_used_bytes: int
@@ -145,14 +145,14 @@ class MachineLoad:
 
 
 def measure_machine_load() -> MachineLoad:
-    """Measure the load of the machine. The first call has no earlier call to compare with and reports idle cores."""
+    """Measure the load of the machine. The first call has no earlier one to compare with and reports idle cores."""
     memory, percents = psutil.virtual_memory(), psutil.cpu_percent(percpu=True)
     return MachineLoad(tuple(percent / 100 for percent in percents), memory.total - memory.available, memory.total)
 
 
 class ProcessLoad:
-    """Measures which share of all `cores` this process uses, and for which share of the time other programs delay its
-    work, between two calls of `measure`. `cpu_clock` counts all threads of this process."""
+    """Measures the fraction of all `cores` that this process uses, and the fraction of time in which other programs
+    delay its work, between two calls of `measure`. `cpu_clock` counts all threads of this process."""
 
     def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock
@@ -171,11 +171,11 @@ class ProcessLoad:
         self._ran_s += work.cpu_s
 
     def measure(self) -> tuple[float, float]:
-        """Return two shares since the last call, 0..1: the share of all cores that this process used, and the share of
+        """Return two fractions since the last call, 0..1: that of all cores that this process used, and that of the
         time taken by the added work if other programs delayed it, else 0."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._measured_s, cpu_s - self._cpu_s)
-        was_delayed = self._ran_s < (1 - _MIN_WAITING_SHARE) * self._busy_s
+        was_delayed = self._ran_s < (1 - _MIN_WAIT_FRACTION) * self._busy_s
         late_share = min(1.0, self._busy_s / span.wall_s) if was_delayed and span.wall_s > 0 else 0.0
         self._measured_s, self._cpu_s = now_s, cpu_s
         self._busy_s = self._ran_s = 0.0

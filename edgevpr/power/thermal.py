@@ -10,9 +10,9 @@ from pathlib import Path
 
 from edgevpr.power import machine
 
-_DEFAULT_LIMIT_C = 80.0  # the Raspberry Pi firmware throttles from here; cautious for other boards
+_DEFAULT_LIMIT_C = 80.0  # the Raspberry Pi firmware throttles from here on; conservative for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
-# Bits of the firmware's reply for the current state. Shifted by 16, they stand for any time since boot.
+# Bits of the firmware's reply for the current state. Shifted left by 16, they are for any time since boot.
 _FIRMWARE_BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
 _UNDER_VOLTAGE_BIT = 1
 _SLOWDOWN_BITS = 2 | 4 | 8
@@ -86,23 +86,23 @@ class ThermalWatch:
     def _find_slowdown_signs(
         self, bits: int, temperature_c: float | None, khz: int | None
     ) -> Iterator[tuple[bool, str]]:
-        """Yield a pair for each sign of throttling: True if it is throttling now (False: only a warning, or over), and
+        """Yield a pair for each sign of throttling: True if it is throttling now (False: only a warning, or past), and
         a text. `bits`: flags of the firmware (0: none). `khz`: current CPU frequency."""
-        if now := [word for bit, word in _FIRMWARE_BITS if bits & bit]:
-            yield bool(bits & _SLOWDOWN_BITS), f"{', '.join(now)} now"
-        if before := [word for bit, word in _FIRMWARE_BITS if bits >> 16 & bit and not bits & bit]:
-            yield False, f"{', '.join(before)} since start"
+        if current := [word for bit, word in _FIRMWARE_BITS if bits & bit]:
+            yield bool(bits & _SLOWDOWN_BITS), f"{', '.join(current)} now"
+        if past := [word for bit, word in _FIRMWARE_BITS if bits >> 16 & bit and not bits & bit]:
+            yield False, f"{', '.join(past)} since start"
         if self._policy:
-            # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the highest so far is
-            # normal.
+            # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the normal limit is the
+            # highest so far.
             allowed_khz = _read_number(self._policy / "scaling_max_freq") or 0
             self._allowed_khz = max(self._allowed_khz, allowed_khz)
             normal_khz = self._allowed_khz or self._top_khz
-            hot = temperature_c is not None and temperature_c >= self._limit_c
+            is_hot = temperature_c is not None and temperature_c >= self._limit_c
             if 0 < allowed_khz < 0.98 * normal_khz:
                 yield True, f"frequency limited to {allowed_khz / 1000:g} of {normal_khz / 1000:g} MHz"
-            # A low frequency alone proves nothing, because idle cores slow down; a hot machine is not idle.
-            elif hot and khz and khz < 0.9 * normal_khz:
+            # A low frequency alone is no evidence, because idle cores slow down; a hot machine is not idle.
+            elif is_hot and khz and khz < 0.9 * normal_khz:
                 yield True, f"{khz / 1000:g} of {normal_khz / 1000:g} MHz at {temperature_c:g} degrees"
 
 

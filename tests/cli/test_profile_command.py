@@ -86,7 +86,7 @@ def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):
 @pytest.mark.parametrize(
     ("argv", "code", "sentence"),
     [
-        (["--places", "50", "--battery", "4X"], 2, "The battery pack `4X` is invalid: write its cells in series"),
+        (["--places", "50", "--battery", "4X"], 2, "The battery pack is `4X`, but must be the number of cells"),
         (["--map", "nowhere.gpkg"], 1, "There is no map"),
         (["--places", "50", "--rate-hz", "0"], 2, "the command line: `source.rate_hz` is 0"),
         (["--places", "50", "--board", "rpi4"], 2, "There is no board `rpi4`"),

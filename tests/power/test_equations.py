@@ -60,6 +60,6 @@ def test_parse_pack_refuses_nonsense_in_one_sentence(text):
     with pytest.raises(ConfigError) as raised:
         parse_pack(text)
     assert str(raised.value) == (
-        f"The battery pack `{text}` is invalid: write its cells in series (1 to 24), S and its capacity in mAh "
-        "(1 to 999999), as in 4S5200."
+        f"The battery pack is `{text}`, but must be the number of cells in series (1 to 24), S and the capacity in mAh "
+        "(1 to 999999), such as 4S5200."
     )
