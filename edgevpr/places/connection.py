@@ -1,5 +1,5 @@
-"""The connection to an open map file, the lock of the one program that may add places, and the check that the file has
-not been replaced. `mapfile.PlaceMap` extends it with the meaning of the rows."""
+"""The connection to an open map file, the lock held by the one program that may add places, and the check that the file
+has not been replaced. `mapfile.PlaceMap` extends it with the meaning of the rows."""
 
 import os
 import sqlite3
@@ -19,11 +19,11 @@ from edgevpr.places.rows import Content, Values
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_MAX_METADATA_BYTES = 100_000  # of a row without its descriptor: mainly the image's name
+_MAX_METADATA_BYTES = 100_000  # of a row without its descriptor: mostly the image's name
 
 
 class MapConnection:
-    """A connection to a map file. Make it with `create`, `open` or `open_for_adding`, and close it or use `with`.
+    """A connection to a map file. Create it with `create`, `open` or `open_for_adding`, and close it or use `with`.
 
     `stored` holds the values of the table edgevpr_map (see `mapspec`), and `spec` describes the technique that made the
     descriptors. `db` is the current SQLite connection: `require_unchanged` may replace it.
@@ -32,7 +32,7 @@ class MapConnection:
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
         self.path, self.stored = path, read_stored(path, db)
         self.spec = read_spec(path, self.stored)
-        self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
+        self._lock = lock  # file descriptor of the write lock; None: open for reading only
         self.left_out: dict[int, str] = {}  # see `mapfile.PlaceMap`
         self._wait_s = mapfiles.MAX_WAIT_S
         self._use_connection(db)
@@ -69,21 +69,21 @@ class MapConnection:
         format version, and UsageError for a name that no file can have."""
         path = mapfiles.require_map_file(path)
         mapfiles.merge_leftover_log(path)
-        return cls._open(path, adds=False)
+        return cls._open(path, is_writable=False)
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "Self":
-        """Open an existing map to add places to it. Raises the errors of `open`, and MapBusyError while another program
-        adds places to the map."""
-        return cls._open(mapfiles.require_map_file(path), adds=True)
+        """Open an existing map to add places. Raises the errors of `open`, and MapBusyError if another program has it
+        open for writing."""
+        return cls._open(mapfiles.require_map_file(path), is_writable=True)
 
     @classmethod
-    def _open(cls, path: Path, adds: bool) -> "Self":
+    def _open(cls, path: Path, is_writable: bool) -> "Self":
         with ExitStack() as undo, translate_errors(path):
-            lock = mapfiles.lock_map(path) if adds else None
+            lock = mapfiles.lock_map(path) if is_writable else None
             if lock is not None:
                 undo.callback(os.close, lock)
-            db = mapfiles.connect(path, "rw" if adds else "ro")
+            db = mapfiles.connect(path, "rw" if is_writable else "ro")
             undo.callback(db.close)
             place_map = cls(path, db, lock)
             undo.pop_all()
@@ -96,8 +96,8 @@ class MapConnection:
         self.close()
 
     def close(self) -> None:
-        """Close the file. If it was open for adding, first merge SQLite's log into it: the single file that remains is
-        readable even on a read-only medium."""
+        """Close the file. If it was open for writing, first merge the write-ahead log into it, so that the single file
+        that remains is readable even on a read-only medium."""
         if self._lock is not None:
             mapfiles.merge_write_ahead_log(self.db)
         self.db.close()
@@ -106,34 +106,34 @@ class MapConnection:
             self._lock = None
 
     def require_unchanged(self) -> None:
-        """Raise MapError if the file is gone, cannot be read, or has been replaced by another map since it was opened.
-        If another program has touched the file, it is reopened, and its map_id and technique are compared, because the
-        old connection may have cached pages of a replaced file."""
+        """Raise MapError if the file is missing, cannot be read, or has been replaced by another map since it was
+        opened. If another program has modified the file, it is reopened, and its map_id and technique are compared,
+        because the old connection may have cached pages of a replaced file."""
         with translate_errors(self.path):
             state = self._read_file_state()
             if state == self._file_state:
                 return
             mapfiles.require_map_file(self.path)
-            fresh = mapfiles.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
+            new_db = mapfiles.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
             try:
-                if read_stored(self.path, fresh) != self.stored:
+                if read_stored(self.path, new_db) != self.stored:
                     raise MapError(f"{self.path} was replaced by another map: restore the original.")
             except BaseException:
-                fresh.close()
+                new_db.close()
                 raise
             self.db.close()
-            self._use_connection(fresh)
+            self._use_connection(new_db)
             self._file_state = self._read_data_version(), *state[1:]
 
     def set_max_wait(self, wait_s: float) -> None:
-        """Set how many seconds to wait for another program that is writing, before MapBusyError is raised."""
+        """Set the number of seconds to wait for another program that is writing before raising MapBusyError."""
         self._wait_s = wait_s
         self.db.execute(f"PRAGMA busy_timeout = {round(1000 * wait_s)}")
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Run the body of `with` as one transaction: commit all it writes, or nothing if it raises an exception. Raises
-        MapError for errors of SQLite."""
+        """Run the body of `with` as one transaction: commit everything that it writes, or roll back if it raises an
+        exception. Raises MapError for SQLite errors."""
         with translate_errors(self.path):
             self.db.execute("BEGIN IMMEDIATE")
             try:
@@ -151,7 +151,7 @@ class MapConnection:
             yield from rows.scan_rows(self.db, columns)
 
     def read_row(self, place_id: int, columns: str) -> Content:
-        """Return the values of `columns` of one place, by name. Raises PlaceError if it does not exist, or SQLite
+        """Return the values of `columns` of one place, by name. Raises PlaceError if the place does not exist or SQLite
         cannot read its row."""
         with translate_errors(self.path):
             try:
@@ -167,7 +167,7 @@ class MapConnection:
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""
         with translate_errors(self.path):
-            try:  # not count(*): no progress handler can end it in a table that refers to itself
+            try:  # not count(*): no progress handler can interrupt it in a table that refers to itself
                 return int(self.db.execute("SELECT total(1) FROM places").fetchone()[0])
             except sqlite3.Error as error:
                 if not is_row_error(error):
@@ -186,7 +186,7 @@ class MapConnection:
             connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_bytes)
 
     def _read_data_version(self) -> int | None:
-        """Return SQLite's data_version, which changes when others write; None if the file can no longer be read."""
+        """Return SQLite's data_version, which changes when other programs write; None if the file cannot be read."""
         try:
             return int(self.db.execute("PRAGMA data_version").fetchone()[0])
         except (sqlite3.Error, UnicodeDecodeError) as error:
@@ -195,10 +195,9 @@ class MapConnection:
             return None
 
     def _read_file_state(self) -> tuple[int | None, ...]:
-        """Return numbers about the file that differ from those of an earlier call if another program has written to the
-        file or replaced it in the meantime."""
+        """Return values that change whenever another program writes to the file or replaces it."""
         try:
             file = self.path.stat()
         except OSError as error:
-            raise MapError(f"{self.path} is gone ({error.strerror}): restore it.") from error
+            raise MapError(f"{self.path} is missing ({error.strerror}): restore the file.") from error
         return self._read_data_version(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns

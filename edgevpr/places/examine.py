@@ -19,15 +19,15 @@ from edgevpr.places.index import choose_places
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, RowError, Values
 
-_MAX_FAULTS = 20  # listed by SQLite
+_MAX_FAULTS = 20  # to be listed by SQLite
 _NO_LANDMARKS: Content = {"landmarks": None, "landmarks_crc32": None}
-_LOW_QUALITY_FACTOR = 0.5  # on the value of a place that was added only to close a gap
+_LOW_QUALITY_FACTOR = 0.5  # applied to the value of a place that was added only to close a gap
 
 
 class PlaceCheck(NamedTuple):
     """The result of checking one place. `problem` describes the damage in a few words (None: no damage). `content` has
-    the values of its row by column name, without damaged landmarks (empty: unreadable). `is_usable`: True if at most
-    its landmarks are damaged."""
+    the values of its row by column name, without damaged landmarks (empty: unreadable). `is_usable`: nothing but its
+    landmarks is damaged."""
 
     place_id: int
     problem: str | None
@@ -43,9 +43,9 @@ def read_place_positions(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
 
 @dataclass(frozen=True, slots=True)
 class MapCheck:
-    """The result of checking a map. `places` is the number of readable places, of `total`. `damaged` has (place id,
-    problem in few words) of each damaged place; a place with damaged landmarks only can still be read. `faults` are
-    SQLite's messages about the file as a whole."""
+    """The result of checking a map. `places` of `total` places are readable. `damaged` has (place id, short problem) of
+    each damaged place; one whose landmarks alone are damaged is still readable. `faults` are SQLite's messages about
+    the file as a whole."""
 
     path: str
     places: int
@@ -59,8 +59,8 @@ class MapCheck:
 
 
 def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterator[PlaceCheck]:
-    """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order the
-    places were added."""
+    """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order in
+    which the places were added."""
     spec = place_map.spec
     for place_id, row in place_map.scan_rows(rows.ALL_COLUMNS) if only is None else _read_rows(place_map, only):
         if row is not None:
@@ -106,26 +106,27 @@ def merge_maps(
 ) -> tuple[list[tuple[int, int]], bool]:
     """Merge the places of several maps into the new map `out`; if that fails, leave no file. `only`: for each map, the
     ids of the places to merge (None: all). Returns (places copied, duplicates) for each map, and True if any map was
-    calibrated; `out` is not.
+    calibrated; `out` never is.
 
-    A place is a duplicate if image name and time are equal and the coarse parts nearly so (`PlaceMap.has_descriptor`).
-    Mask hash and lens are copied if they are the same in all maps; all attributions are copied. Raises MapError if the
-    techniques differ or a file cannot be read or written, and PlaceError if a place is damaged."""
+    A place is a duplicate if its image name and time are equal and its coarse part nearly equal to those of another
+    (`PlaceMap.has_descriptor`). Mask hash and lens are copied if they are the same in all maps; all attributions are
+    copied. Raises MapError if the techniques differ or a file cannot be read or written, and PlaceError if a place is
+    damaged."""
     with ExitStack() as stack:
-        unfinished = stack.enter_context(mapfiles.write_atomically(out))
+        temp_path = stack.enter_context(mapfiles.write_atomically(out))
         maps = [stack.enter_context(PlaceMap.open(path)) for path in paths]
         for other in maps[1:]:
             other.require_technique(maps[0].spec)
         masks, lenses = {source.mask_sha256 for source in maps}, {source.lens for source in maps}
-        with PlaceMap.create(unfinished, maps[0].spec) as merged:
+        with PlaceMap.create(temp_path, maps[0].spec) as target:
             if len(masks) == 1:
-                merged.record_mask(*masks)
+                target.record_mask(*masks)
             if len(lenses) == 1:
-                merged.record_lens(*lenses)
+                target.record_lens(*lenses)
             for source in maps:
-                merged.add_attribution(source.attribution)
+                target.add_attribution(source.attribution)
             counts = [
-                _add_places(merged, source, progress, place_ids)
+                _add_places(target, source, progress, place_ids)
                 for source, place_ids in zip(maps, only or [None] * len(maps), strict=True)
             ]
             return counts, any(source.calibration is not None for source in maps)
@@ -134,8 +135,8 @@ def merge_maps(
 def _add_places(
     place_map: PlaceMap, source: PlaceMap, progress: Progress, only: Collection[int] | None
 ) -> tuple[int, int]:
-    """Copy the places of `source`, or those with the ids `only`, into `place_map`, except duplicates; return the
-    numbers (copied, duplicates)."""
+    """Copy the places of `source`, or those with the ids `only`, into `place_map`, except for duplicates. Return the
+    number of places copied and the number of duplicates."""
     copied = duplicates = 0
     with place_map.transaction():
         ids_by_picture = place_map.select_ids("source_image, time")
@@ -169,24 +170,24 @@ def check_map(path: str | Path, progress: Progress = iterate_silently) -> MapChe
 
 def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
     """Replace the map by a copy of its usable places, which keep their ids and get checksums; keep the original as
-    `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError, and
-    leaves the map unchanged, if no place can be read, if the original of an earlier repair exists, or if the copy
-    cannot be written."""
+    `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError and
+    leaves the map unchanged if no place can be read, if the original of an earlier repair exists, or if the copy cannot
+    be written."""
     path = mapfiles.require_map_file(path)
     original = path.with_name(path.name + ".damaged")
     if original.exists():
-        raise MapError(f"{original} exists already, from an earlier repair: move it away first.")
+        raise MapError(f"{original} exists already, from an earlier repair: move that file away first.")
     copy = path.with_name(f".{path.name}.{os.getpid()}")
-    lock = mapfiles.lock_map(path)  # until the end, no program can add places that the copy would lack
+    lock = mapfiles.lock_map(path)  # until the end, so that no program adds places that the copy would lack
     try:
         with PlaceMap.open(path) as damaged:
             if not _copy_usable(damaged, copy, progress(check_places(damaged), len(damaged), "copying")):
                 raise MapError(f"{path}: none of its places can be read: restore a copy, or build it again.")
-        for file, kept in zip(mapfiles.list_sqlite_files(path), mapfiles.list_sqlite_files(original), strict=True):
+        for file, backup in zip(mapfiles.list_sqlite_files(path), mapfiles.list_sqlite_files(original), strict=True):
             if file.exists():  # otherwise SQLite would apply the log of the damaged map to the copy
-                file.rename(kept)
+                file.rename(backup)
         try:
-            os.link(path, original)  # a link first, so that there is a map at `path` at all times
+            os.link(path, original)  # a link first, so that `path` is a map at all times
         except OSError:
             path.rename(original)  # a FAT file system has no links
         copy.replace(path)
@@ -199,28 +200,28 @@ def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
 
 def copy_places(path: str | Path, out: Path, place_ids: Collection[int]) -> int:
     """Copy places of a map to the new file `out`, as `shrink_map` does; return their number."""
-    with mapfiles.write_atomically(out) as unfinished, PlaceMap.open(path) as place_map:
-        return _copy_usable(place_map, unfinished, check_places(place_map, place_ids))
+    with mapfiles.write_atomically(out) as temp_path, PlaceMap.open(path) as place_map:
+        return _copy_usable(place_map, temp_path, check_places(place_map, place_ids))
 
 
 def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = iterate_silently) -> tuple[int, int]:
     """Copy the `count` best readable places of a map to the new file `out`: those of high quality that leave small gaps
     (see `choose_places`). They keep their ids, since the calibration, which is copied like the mask hash, refers to
-    them. Returns (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if
-    `out` exists or cannot be written; no part of a file is then left."""
-    with mapfiles.write_atomically(out) as unfinished, PlaceMap.open(path) as place_map:
+    them. Returns (number of places copied, number of readable places). Raises MapError, and leaves no partial file, if
+    the map cannot be read, or if `out` exists or cannot be written."""
+    with mapfiles.write_atomically(out) as temp_path, PlaceMap.open(path) as place_map:
         checks = progress(check_places(place_map), len(place_map), "reading")
         places = [rows.parse_place(check.place_id, check.content) for check in checks if check.is_usable]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = choose_places(lat_deg, lon_deg, np.array([_rate_place(place) for place in places]), count)
-        kept = [places[number].place_id for number in best.tolist()]
-        checks = progress(check_places(place_map, kept), len(kept), "copying")
-        return _copy_usable(place_map, unfinished, checks), len(places)
+        place_ids = [places[row].place_id for row in best.tolist()]
+        checks = progress(check_places(place_map, place_ids), len(place_ids), "copying")
+        return _copy_usable(place_map, temp_path, checks), len(places)
 
 
 def _rate_place(place: Place) -> float:
-    """Return the value of keeping a place, 0..1: quality, times memorability and staticity if known."""
+    """Return the value of a place, 0..1: its quality, times memorability and staticity if known."""
     salience = place.salience
     if salience is None:
         return place.quality

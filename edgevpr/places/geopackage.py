@@ -14,9 +14,9 @@ _WGS84_WKT = (
     'AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4326"]]'
 )
 
-# The checksums (CRC-32 of zlib) precede the BLOBs: SQLite reads all of a large BLOB to find what comes after it. A
-# program that moves a place (QGIS) does not update the checksums. So a trigger deletes those of position and pose, and
-# the recorded position (see `core.types.Pose`): a place that was moved must not be refined from it again.
+# The checksums (CRC-32 of zlib) precede the BLOBs because SQLite reads all of a large BLOB to find what follows it. A
+# program that moves a place (QGIS) does not update the checksums, so a trigger deletes those of position and pose, and
+# the recorded position (see `core.types.Pose`), from which a place that was moved must not be refined again.
 SCHEMA = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
     srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -57,7 +57,7 @@ INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_i
 INSERT INTO gpkg_geometry_columns VALUES ('places', 'geom', 'POINT', {WGS84}, 0, 0);
 """
 
-# A layer's extent grows with every point, in the same transaction.
+# Extends a layer's extent with each point, in the same transaction.
 GROW_EXTENT = """
 UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),
     min_x = min(coalesce(min_x, :lon), :lon), max_x = max(coalesce(max_x, :lon), :lon),
@@ -67,7 +67,7 @@ WHERE table_name = :table
 
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
-_POINT_HEADER = (b"GP", 0, 1, 1, 1)  # all of these but the reference system and the coordinates
+_POINT_HEADER = (b"GP", 0, 1, 1, 1)  # all fields except reference system and coordinates
 
 
 def encode_point(lat_deg: float, lon_deg: float) -> bytes:
@@ -80,11 +80,11 @@ def decode_point(blob: object) -> tuple[float, float]:
     message for anything that is not a WGS-84 point on the Earth."""
     if not isinstance(blob, bytes) or len(blob) != _POINT.size:
         raise ValueError("its geometry is not a point")
-    *start, srs_id, order, kind, lon_deg, lat_deg = _POINT.unpack(blob)
-    if (*start, order, kind) != _POINT_HEADER:
+    *header, srs_id, order, geometry_type, lon_deg, lat_deg = _POINT.unpack(blob)
+    if (*header, order, geometry_type) != _POINT_HEADER:
         raise ValueError("its geometry is not a point")
     if srs_id != WGS84:
-        raise ValueError(f"its position is in the reference system {srs_id}, not in WGS 84")
+        raise ValueError(f"its position is in reference system {srs_id}, not in WGS 84")
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         raise ValueError(f"latitude {lat_deg:g}, longitude {lon_deg:g} is not on the Earth")
     return lat_deg, lon_deg
@@ -111,7 +111,7 @@ def format_utc(t_utc_s: float | None) -> str | None:
 
 
 def parse_utc(text: object) -> float | None:
-    """Parse a time as `format_utc` writes it; return seconds since 1970, or None for anything else."""
+    """Parse a time in the format of `format_utc`; return seconds since 1970, or None for anything else."""
     try:
         return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if isinstance(text, str) else None
     except (ValueError, OverflowError):

@@ -29,8 +29,8 @@ CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `Plac
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceIndex:
-    """The part of a map that is held in RAM to be scanned: contiguous arrays of N places in the order mapped. A place's
-    number in these arrays is its *slot*.
+    """The part of a map that is held in RAM to be scanned: contiguous arrays of N places, in the order in which they
+    were mapped. A place's index in these arrays is its *slot*.
 
     `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN for a place without a position.
     `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN if unknown. `rows` (N, *row shape) has the
@@ -68,9 +68,9 @@ class PlaceIndex:
     def spacing_m(self) -> float | None:
         """Return the median distance in metres between successive places; None if no two successive places have
         positions."""
-        away_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
-        away_m = away_m[~np.isnan(away_m)]
-        return float(np.median(away_m)) if len(away_m) else None
+        steps_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
+        steps_m = steps_m[~np.isnan(steps_m)]
+        return float(np.median(steps_m)) if len(steps_m) else None
 
     def find_within(self, position: Position, radius_m: float) -> Bools:
         """Return bool (N,), True for each place within `radius_m` metres of `position`; False for those without a
@@ -79,14 +79,14 @@ class PlaceIndex:
 
 
 def compute_place_bytes(spec: TechniqueSpec) -> int:
-    """Return how many bytes of RAM one place of the index needs."""
+    """Return the number of bytes of RAM that one place of the index needs."""
     return spec.row.nbytes + _METADATA_BYTES
 
 
 def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, extra_bytes: int = 0) -> PlaceIndex:
-    """Load the coarse parts of a map, packed by the technique. Return the index of the places that were loaded.
+    """Load the coarse parts of a map, packed by the technique. Return the index of the loaded places.
 
-    If `budget_bytes` is too small for all, only the places of `choose_places` are loaded. `extra_bytes` per place are
+    If `budget_bytes` is too small for all, only those chosen by `choose_places` are loaded. `extra_bytes` per place are
     reserved for other arrays that grow with the index (see `sequence`). Places that cannot be read are recorded in
     `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small for one."""
     spec = technique.spec
@@ -100,7 +100,7 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, ext
         )
     capacity = min(places, budget_bytes // place_bytes)
     index = allocate_index(spec, capacity, place_map.compute_mean_coarse() if spec.packed else None)
-    # Another program may have added places since they were counted: they are ignored until the next load.
+    # Places that another program has added since they were counted are ignored until the next load.
     parts: Iterator[CoarsePart] = islice(place_map.read_coarse_parts(), places)
     if capacity < places:
         _log.warning(
@@ -109,10 +109,10 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, ext
             f"{np.ceil(places * place_bytes / 1e5) / 10:g} for all."
         )
         rows = np.fromiter(islice(place_map.read_outlines(), places), _OUTLINE_DTYPE)
-        kept = rows["id"][choose_places(rows["lat_deg"], rows["lon_deg"], rows["quality"], capacity)]
-        parts = _filter_parts(parts, kept)
-    loaded = _fill_index(index, parts, technique)
-    if not loaded:
+        chosen_ids = rows["id"][choose_places(rows["lat_deg"], rows["lon_deg"], rows["quality"], capacity)]
+        parts = _filter_parts(parts, chosen_ids)
+    count = _fill_index(index, parts, technique)
+    if not count:
         raise MapError(f"{place_map.path}: none of its {places} places can be read: restore a copy, or build it again.")
     if place_map.left_out:
         _log.warning(
@@ -120,12 +120,12 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, ext
             place_map.path,
             len(place_map.left_out),
         )
-    return index.select(slice(loaded))
+    return index.select(slice(count))
 
 
 def allocate_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> PlaceIndex:
-    """Allocate the arrays of `capacity` places, with `mean` as in `PlaceIndex`. The operating system provides memory
-    for `place_ids` and `rows` only when they are written."""
+    """Allocate arrays for `capacity` places, with `mean` as in `PlaceIndex`. The operating system provides memory for
+    `place_ids` and `rows` only when they are written."""
     return PlaceIndex(
         place_ids=np.empty(capacity, np.int64),
         lat_deg=np.full(capacity, np.nan),
@@ -137,39 +137,39 @@ def allocate_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> 
 
 
 def _fill_index(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> int:
-    """Write coarse parts (of `PlaceMap.read_coarse_parts`), packed by the technique, to the slots of `index` in blocks,
-    until parts or slots run out. Return the number of slots written."""
+    """Write coarse parts (from `PlaceMap.read_coarse_parts`), packed by the technique, to the slots of `index` in
+    blocks, until parts or slots run out. Return the number of slots written."""
     spec = technique.spec
     batch = np.empty((_PACK_BATCH, *spec.coarse.shape), spec.coarse.dtype)
-    filled = 0
-    while block := list(islice(parts, min(_PACK_BATCH, len(index) - filled))):
+    count = 0
+    while block := list(islice(parts, min(_PACK_BATCH, len(index) - count))):
         for row, (*_, coarse) in enumerate(block):
             batch[row] = coarse
         rows = batch[: len(block)] if index.mean is None else technique.pack(batch[: len(block)], index.mean)
-        index.rows[filled : filled + len(block)] = rows
-        for slot, (place_id, point, heading_deg, _) in enumerate(block, start=filled):
+        index.rows[count : count + len(block)] = rows
+        for slot, (place_id, point, heading_deg, _) in enumerate(block, start=count):
             index.place_ids[slot] = place_id
             index.lat_deg[slot], index.lon_deg[slot] = point or (np.nan, np.nan)
             index.heading_deg[slot] = np.nan if heading_deg is None else heading_deg
-        filled += len(block)
-    return filled
+        count += len(block)
+    return count
 
 
-def _filter_parts(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
-    """Yield the parts of the places whose ids are in `ascending`."""
+def _filter_parts(parts: Iterator[CoarsePart], place_ids: Ints) -> Iterator[CoarsePart]:
+    """Yield the parts of the places whose ids are in `place_ids`, which is ascending."""
     for part in parts:
-        nearest = int(np.searchsorted(ascending, part[0]))
-        if nearest < len(ascending) and ascending[nearest] == part[0]:
+        row = int(np.searchsorted(place_ids, part[0]))
+        if row < len(place_ids) and place_ids[row] == part[0]:
             yield part
 
 
 def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int) -> Ints:
-    """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
-    `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
+    """Choose `capacity` of N places, which must be in the order in which they were mapped; return their indices, int,
+    ascending. `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
 
     Places are dropped one at a time, always the one with the lowest value: its quality times the distance to the nearer
-    of its two remaining neighbours along the track. So gaps stay small, and good places stay. The first and the last
-    are kept."""
+    of its two remaining neighbours along the track. So gaps stay small, and good places are kept. The first and the
+    last place are always kept."""
     count = len(quality)
     if count <= capacity:
         return np.arange(count)
@@ -182,29 +182,29 @@ def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: i
         gap_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
         return median_m * (b - a) if math.isnan(gap_m) else gap_m
 
-    def rate_place(before: int, place: int, after: int) -> float:
-        if before < 0 or after >= count:
+    def rate_place(left: int, place: int, right: int) -> float:
+        if left < 0 or right >= count:
             return math.inf
-        # A tiny share of the distance between its neighbours breaks ties among places at the same position.
-        nearer_m = min(measure_distance_m(before, place), measure_distance_m(place, after))
-        return (nearer_m + 1e-6 * measure_distance_m(before, after)) * max(float(quality[place]), 1e-3)
+        # A tiny fraction of the distance between its neighbours breaks ties among places at the same position.
+        nearer_m = min(measure_distance_m(left, place), measure_distance_m(place, right))
+        return (nearer_m + 1e-6 * measure_distance_m(left, right)) * max(float(quality[place]), 1e-3)
 
     # No lists, and few arrays: a map may have a million places.
-    before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
+    lefts, rights = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
     values = np.full(-(-count // _BLOCK_PLACES) * _BLOCK_PLACES, np.inf)  # infinite for dropped places too
     for place in range(count):
         values[place] = rate_place(place - 1, place, place + 1)
     blocks = values.reshape(-1, _BLOCK_PLACES)
     block_minima = blocks.min(axis=1)
-    kept = np.ones(count, bool)
+    is_kept = np.ones(count, bool)
     for _ in range(count - max(capacity, 2)):
         block = int(block_minima.argmin())
         place = block * _BLOCK_PLACES + int(blocks[block].argmin())
-        kept[place], values[place] = False, np.inf
-        neighbours = int(before[place]), int(after[place])
-        after[neighbours[0]], before[neighbours[1]] = neighbours[1], neighbours[0]
+        is_kept[place], values[place] = False, np.inf
+        neighbours = int(lefts[place]), int(rights[place])
+        rights[neighbours[0]], lefts[neighbours[1]] = neighbours[1], neighbours[0]
         for neighbour in neighbours:
-            values[neighbour] = rate_place(int(before[neighbour]), neighbour, int(after[neighbour]))
-        for changed in {block, *(neighbour // _BLOCK_PLACES for neighbour in neighbours)}:
-            block_minima[changed] = blocks[changed].min()
-    return np.flatnonzero(kept)[:capacity]
+            values[neighbour] = rate_place(int(lefts[neighbour]), neighbour, int(rights[neighbour]))
+        for changed_block in {block, *(neighbour // _BLOCK_PLACES for neighbour in neighbours)}:
+            block_minima[changed_block] = blocks[changed_block].min()
+    return np.flatnonzero(is_kept)[:capacity]

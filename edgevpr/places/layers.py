@@ -1,7 +1,7 @@
-"""Layers of a map: places grouped by the footprint at which they were cut from an orthophoto. Most maps have one.
+"""Layers of a map: groups of places that were cut from an orthophoto at the same footprint. Most maps have one layer.
 
 A picture matches best among places that show slightly less ground, in finer detail. So if a flight is higher or lower
-than planned, a map with several footprints finds more of its pictures.
+than planned, a map with several footprints recognises more of its pictures.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
 
-# Footprint of the places that match a picture best, as a share of the picture's (benchmarks/results/from_space.md)
+# Footprint of the places that match a picture best, divided by the picture's (benchmarks/results/from_space.md)
 _BEST_FOOTPRINT_RATIO = 0.92
 _MAX_LAYER_RATIO = 1.2  # footprints whose ratio is smaller belong to one layer
 
@@ -23,28 +23,28 @@ _MAX_LAYER_RATIO = 1.2  # footprints whose ratio is smaller belong to one layer
 class Layers:
     """The `footprints_m` of a map, ascending: those at which its places were cut or, in a map with one layer,
     `median_m`, the median of all places (None: unknown, and `footprints_m` is empty). With several layers, `place_ids`
-    int64 (M,), ascending, are the places that were cut, and `layer` int (M,) the number of each one's footprint."""
+    int64 (M,), ascending, are the places that were cut, and `layer` int (M,) is the index of each one's footprint."""
 
     median_m: float | None
     footprints_m: tuple[float, ...]
     place_ids: Ints
     layer: Ints
 
-    def choose_footprint(self, seen_m: float | None) -> float | None:
-        """Return the footprint of the layer to search for a picture that shows `seen_m` of ground; None: unknown."""
-        if not seen_m or not self.footprints_m:
+    def choose_footprint(self, picture_m: float | None) -> float | None:
+        """Return the footprint of the layer to search for a picture with the footprint `picture_m`; None: unknown."""
+        if not picture_m or not self.footprints_m:
             return None
-        return self.footprints_m[int(_find_nearest(self.footprints_m, _BEST_FOOTPRINT_RATIO * seen_m))]
+        return self.footprints_m[int(_find_nearest(self.footprints_m, _BEST_FOOTPRINT_RATIO * picture_m))]
 
     def narrow_search(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
         """Narrow a search to the places of the index that were cut at about `footprint_m` (None: search all layers), if
-        any of them is in reach. Places that were not cut are kept."""
+        any of them is in reach. Places that were not cut from an orthophoto are kept."""
         if footprint_m is None or len(self.footprints_m) < 2:
             return expected
         rows = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
         is_listed, layer = self.place_ids[rows] == index.place_ids, _find_nearest(self.footprints_m, footprint_m)
-        is_other = is_listed & (self.layer[rows] != layer)
-        in_reach = ~is_other if expected.in_reach is None else expected.in_reach & ~is_other
+        is_other_layer = is_listed & (self.layer[rows] != layer)
+        in_reach = ~is_other_layer if expected.in_reach is None else expected.in_reach & ~is_other_layer
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
 
 
@@ -64,6 +64,6 @@ def read_layers(place_map: PlaceMap) -> Layers:
 
 
 def _find_nearest(footprints_m: Sequence[float], length_m: float | Doubles) -> Ints:
-    """Return the number of the footprint that is nearest, by ratio, to `length_m` or to each of its lengths."""
+    """Return the index of the footprint with the closest ratio to `length_m`, or to each of its lengths."""
     log_ratios = np.subtract.outer(np.log(length_m), np.log(footprints_m))
     return np.asarray(np.abs(log_ratios).argmin(axis=-1))

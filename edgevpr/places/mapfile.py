@@ -25,9 +25,9 @@ from edgevpr.places.mapfiles import is_row_error, translate_errors
 from edgevpr.places.rows import Content, RowError, Values
 
 _COARSE_COLUMNS = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
-_OWNER_SEPARATOR = "; "
-_MAX_DIFFERENT_SHARE = 0.05  # of the values of two coarse parts of the same picture
-_MAX_RELATIVE_DIFFERENCE = 0.01  # norm of their difference: far above rounding, far below that of two pictures
+_ATTRIBUTION_SEPARATOR = "; "
+_MAX_DIFFERENT_FRACTION = 0.05  # of the values of two coarse parts of the same picture
+_MAX_RELATIVE_DIFFERENCE = 0.01  # of their norm: far above rounding errors, far below that of two pictures
 
 
 class Footprints(NamedTuple):
@@ -64,9 +64,8 @@ class PlaceMap(MapConnection):
     the order of discovery.
 
     `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the camera calibration
-    used to undistort their pictures. `attribution`: owners of the orthophotos from which places were cut, in their own
-    words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). Each is None if absent or
-    unknown."""
+    used to undistort their pictures. `attribution`: attribution texts of the orthophotos from which places were cut.
+    `calibration`: the calibration of confidences (see `mapmaking.calibrate`). Each is None if absent or unknown."""
 
     mask_sha256 = _StoredText(mapspec.MASK)
     lens = _StoredText(mapspec.LENS)
@@ -84,7 +83,7 @@ class PlaceMap(MapConnection):
     def add(
         self, frame: Frame, descriptor: Descriptor, salience: Salience | None = None, landmarks: bytes | None = None
     ) -> int:
-        """Add one place, and return its id once it is safe on the disk. Raises MapError (disk full, ...).
+        """Add one place, and return its id once it is safely on disk. Raises MapError (disk full, ...).
 
         `salience` and `landmarks` (encoded bytes) are None if there are none. An impossible time or altitude is stored
         as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes.
@@ -97,8 +96,8 @@ class PlaceMap(MapConnection):
         """Insert a row with its checksums, inside a `transaction`; return its id. `place_id` None: SQLite chooses the
         next id. Raises sqlite3.Error."""
         row = {"place_id": place_id, **content, **rows.compute_checksums(content)}
-        marks = ", ".join("?" * len(row))
-        cursor = self.db.execute(f"INSERT INTO places ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
+        placeholders = ", ".join("?" * len(row))
+        cursor = self.db.execute(f"INSERT INTO places ({', '.join(row)}) VALUES ({placeholders})", tuple(row.values()))
         if row["geom"] is not None:
             self._grow_extent(*geopackage.decode_point(row["geom"]))
         return int(cursor.lastrowid or 0)
@@ -126,17 +125,17 @@ class PlaceMap(MapConnection):
             self._record_text(mapspec.LENS, Path(path).name)
 
     def add_attribution(self, text: str | None) -> None:
-        """Add an owner's words to the stored attribution (None: store nothing). Raises MapError."""
+        """Add an attribution text to the stored ones (None: store nothing). Raises MapError."""
         if text:
-            owners = [*(self.attribution or text).split(_OWNER_SEPARATOR), *text.split(_OWNER_SEPARATOR)]
-            self._record_text(mapspec.ATTRIBUTION, _OWNER_SEPARATOR.join(dict.fromkeys(owners)))
+            texts = [*(self.attribution or text).split(_ATTRIBUTION_SEPARATOR), *text.split(_ATTRIBUTION_SEPARATOR)]
+            self._record_text(mapspec.ATTRIBUTION, _ATTRIBUTION_SEPARATOR.join(dict.fromkeys(texts)))
 
     def record_calibration(self, text: str | None) -> None:
         """Store the map's calibration of confidences, as text (None: not calibrated). Raises MapError."""
         self._record_text(mapspec.CALIBRATION, text)
 
     def read_places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
-        """Yield the places `place_ids`, in that order (None: all places, in the order they were added). Raises
+        """Yield the places `place_ids`, in that order (None: all places, in the order in which they were added). Raises
         PlaceError for a place that is missing or damaged."""
         for place_id in [place_id for place_id, _ in self.scan_rows("1")] if place_ids is None else map(int, place_ids):
             with self._convert_row_errors(place_id):
@@ -145,7 +144,7 @@ class PlaceMap(MapConnection):
 
     def read_coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
         """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part as array of `spec.coarse`) of
-        every readable place, in the order they were added. Record the other places in `left_out`."""
+        every readable place, in the order in which they were added. Record the other places in `left_out`."""
         for place_id, row in self.scan_rows(_COARSE_COLUMNS):
             with self._skip_unreadable(place_id):
                 content = rows.read_columns(_COARSE_COLUMNS, row)
@@ -154,7 +153,7 @@ class PlaceMap(MapConnection):
                 yield place_id, point, heading_deg, part
 
     def compute_mean_coarse(self) -> Singles:
-        """Return the mean of all coarse parts that can be read, float32 of the shape of one part."""
+        """Return the mean of all readable coarse parts, float32 of the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan_rows(columns := "coarse, coarse_crc32"):
             with suppress(RowError):
@@ -180,7 +179,7 @@ class PlaceMap(MapConnection):
             return rows.read_landmarks(self.read_row(int(place_id), "landmarks, landmarks_crc32"))
 
     def read_footprints(self) -> Footprints:
-        """Read the footprints of all places that have one, in the order they were added. Raises MapError."""
+        """Read the footprints of all places that have one, in insertion order. Raises MapError."""
         places = [(place_id, *row) for place_id, row in self.scan_rows("footprint_m, is_surveyed") if row]
         places = [place for place in places if isinstance(place[1], float) and 0 < place[1] < math.inf]
         ids, length_m, is_surveyed = zip(*places, strict=True) if places else ((), (), ())
@@ -197,15 +196,15 @@ class PlaceMap(MapConnection):
         return ids
 
     def has_descriptor(self, place_id: int, coarse: Array) -> bool:
-        """Return True if a place's coarse part nearly equals `coarse`, so that both are of one picture; False if the
-        place cannot be read. Between two runs of a program the last bits of numbers may differ, or a few elements."""
+        """Return True if a place's coarse part nearly equals `coarse`, so that both are from the same picture; False if
+        the place cannot be read. Between two runs, the last bits of values may differ, or a few elements."""
         try:
             stored = rows.decode_part(self.read_row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
         except (RowError, PlaceError):
             return False
         candidate = np.asarray(coarse, np.float32).reshape(stored.shape)
         is_near = np.linalg.norm(stored - candidate) <= _MAX_RELATIVE_DIFFERENCE * np.linalg.norm(stored)
-        return bool(is_near or np.mean(stored != candidate) <= _MAX_DIFFERENT_SHARE)
+        return bool(is_near or np.mean(stored != candidate) <= _MAX_DIFFERENT_FRACTION)
 
     def read_outlines(self) -> Iterator[tuple[int, float, float, float]]:
         """Yield (place_id, lat_deg, lon_deg, quality 0..1) of every readable place, NaN for an unknown position. Record

@@ -17,28 +17,28 @@ MAX_WAIT_S = 5.0  # longest wait for another program that is writing
 # or a damaged table that refers to itself, may never end.
 _MAX_SQLITE_STEPS = 500_000_000
 
-# Words in SQLite's messages, and the advice to the user.
+# Words in SQLite's messages, and advice for the user.
 _ADVICE = {
     "full": "the disk is full: free some space; all places confirmed so far are kept",
-    "not a database": "this is not a place map: give a .gpkg file made by `edgevpr map build`",
-    "readonly": "it is not writable: check its permissions and those of its folder",
+    "not a database": "this is not a place map: use a .gpkg file made by `edgevpr map build`",
+    "readonly": "it is not writable: check the permissions of the file and its folder",
     "unable to open": "it cannot be opened: check the path, and the permissions of the file and its folder",
     "": "the file or its disk is damaged, or it is not a place map ({message}): restore a copy or build it again",
 }
 
 
 def list_sqlite_files(path: Path) -> list[Path]:
-    """Return the paths of the files that SQLite may keep next to a map file, whether they exist or not."""
+    """Return the paths of the files that SQLite may keep next to a map file, whether or not they exist."""
     return [path.with_name(path.name + end) for end in _SQLITE_SUFFIXES]
 
 
 def parse_map_path(name: str | Path) -> Path:
-    """Return `name` as a path. Raises UsageError for a name that no file can have."""
+    """Return `name` as a path. Raises UsageError for an impossible file name."""
     text = str(name)
     with suppress(UnicodeEncodeError):
         if Path(text).name and b"\0" not in os.fsencode(text):
             return Path(text)
-    raise UsageError(f"{text!r} cannot be the name of a map: give the path of a file, e.g. valley.gpkg.")
+    raise UsageError(f"{text!r} cannot be the name of a map: use the path of a file, such as valley.gpkg.")
 
 
 def require_map_file(name: str | Path) -> Path:
@@ -47,14 +47,14 @@ def require_map_file(name: str | Path) -> Path:
     path = parse_map_path(name)
     with translate_errors(path):
         if not path.exists():
-            raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
+            raise MapError(f"There is no map {path}: build one with `edgevpr map build {path} --images DIR`.")
         require_regular(path)
     return path
 
 
 def require_regular(path: Path) -> None:
-    """Raise MapError if the map, or a file of SQLite next to it, exists but is not a regular file: a folder, or a pipe,
-    from which a program would read for ever."""
+    """Raise MapError if the map, or a file of SQLite next to it, exists but is not a regular file. It may be a folder,
+    or a pipe, which a program would read for ever."""
     if path.is_dir():
         raise MapError(
             f"{path} is a folder, but a map is one file: extract the map of a mission from a folder of maps with "
@@ -62,15 +62,15 @@ def require_regular(path: Path) -> None:
         )
     for file in (path, *list_sqlite_files(path)):
         if file.exists() and not file.is_file():
-            raise MapError(f"{file} is not a regular file but a folder, pipe or device: give the path of a map file.")
+            raise MapError(f"{file} is not a regular file but a folder, pipe or device: use the path of a map file.")
 
 
 def lock_map(path: Path, make: bool = False) -> int:
-    """Lock a map for the one program that may add places. Returns a file descriptor; closing it releases the lock.
+    """Lock a map so that only this program can add places. Returns a file descriptor; closing it releases the lock.
 
-    Readers need no lock. SQLite's own lock is not enough, since it lasts for one transaction only: two programs that
+    Readers need no lock. SQLite's own lock is not enough, because it lasts for only one transaction: two programs that
     map the same pictures would add every place twice. `make` creates a missing file. Raises MapBusyError if another
-    program has the lock, and MapError if the file cannot be opened.
+    program holds the lock, and MapError if the file cannot be opened.
     """
     with translate_errors(path):
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
@@ -79,26 +79,26 @@ def lock_map(path: Path, make: bool = False) -> int:
     except BlockingIOError:
         os.close(descriptor)
         raise MapBusyError(
-            f"{path}: another program is adding places to this map: wait until it has finished, or stop it."
+            f"{path}: another program is adding places to this map: wait until it has finished, or stop that program."
         ) from None
     except OSError:
-        pass  # a file system without locks: continue
+        pass  # the file system has no locks: continue
     return descriptor
 
 
 @contextmanager
 def write_atomically(out: Path) -> Iterator[Path]:
     """Yield the path of a temporary file for a new map, and rename it to `out` at the end of `with`. Remove it if the
-    body fails: half a map would look like a complete one. Raises MapError if `out` has content already."""
+    body fails, because half a map would look complete. Raises MapError if `out` has content already."""
     require_regular(out)
     if out.exists() and out.stat().st_size:
         raise MapError(f"{out} exists already: choose another name.")
-    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
+    temp_path = out.with_name(f".{out.name}.{os.getpid()}")
     try:
-        yield unfinished
-        unfinished.replace(out)
+        yield temp_path
+        temp_path.replace(out)
     finally:
-        remove_map(unfinished)
+        remove_map(temp_path)
 
 
 def remove_map(path: Path) -> None:
@@ -108,9 +108,9 @@ def remove_map(path: Path) -> None:
 
 
 def connect(path: Path, mode: str, wait_s: float = MAX_WAIT_S) -> sqlite3.Connection:
-    """Open a map file in SQLite's `mode`, ro or rw. `wait_s` seconds is the longest wait for another program that is
+    """Open a map file in SQLite's `mode`, ro or rw. `wait_s`: longest wait in seconds for another program that is
     writing. Raises sqlite3.Error."""
-    # Autocommit: transactions are begun explicitly, so that nothing is ever half committed.
+    # Autocommit: transactions are begun explicitly, so that nothing is ever committed partially.
     db = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}",
         uri=True,
@@ -135,8 +135,8 @@ def enable_write_ahead_log(db: sqlite3.Connection) -> None:
 
 
 def merge_write_ahead_log(db: sqlite3.Connection) -> None:
-    """Merge SQLite's log into the map file and remove it. The log stays, and does no harm, while another program uses
-    the map."""
+    """Merge the write-ahead log into the map file and remove the log. It stays, without harm, while another program
+    uses the map."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
@@ -150,28 +150,28 @@ def merge_leftover_log(path: Path) -> None:
 
 
 def is_row_error(error: sqlite3.Error) -> bool:
-    """Return True if other rows may still be readable: a damaged page, a lost sector, or a value too large."""
+    """Return True if other rows may still be readable: a damaged page, a lost sector, or an oversized value."""
     return any(words in str(error) for words in ("malformed", "disk I/O", "too big"))
 
 
 @contextmanager
 def translate_errors(path: Path) -> Iterator[None]:
-    """Turn errors of SQLite and of the file system in the body of `with` into a MapError that tells the user what to
-    do; into a MapBusyError if another program is writing."""
+    """Turn errors of SQLite and the file system in the body of `with` into a MapError that tells the user what to do,
+    or into a MapBusyError if another program is writing."""
     try:
         yield
     except OSError as error:
         raise MapError(f"{path}: {_ADVICE['unable to open']} ({error.strerror}).") from error
-    except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
+    except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite quotes a damaged schema
         message = str(error)
         if "locked" in message:
-            raise MapBusyError(f"{path}: another program is writing to it: close that program and retry.") from error
+            raise MapBusyError(f"{path}: another program is writing to it: close that program, then retry.") from error
         advice = next(advice for words, advice in _ADVICE.items() if words in message)
         raise MapError(f"{path}: {advice.format(message=message)}.") from error
 
 
 def _decode_text(raw: bytes) -> str | bytes:
-    """Decode a text value of the file. If it is not UTF-8, return the bytes, which the checks of `rows` refuse."""
+    """Decode a text value of the file. If it is not UTF-8, return the bytes, which the checks in `rows` reject."""
     try:
         return raw.decode()
     except UnicodeDecodeError:

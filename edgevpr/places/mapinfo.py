@@ -23,11 +23,11 @@ SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
 FROM places
 """
 _MIN_COURSES = 10
-_MAX_PASS_STEPS = 3.0  # longest time from one place to the next of the same pass, in median steps
-_MIN_COURSE_LENGTH = 0.9  # of the mean of unit vectors along the courses, for courses in one direction
-_MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from the true position of its picture
-_MEDIAN_PER_SIGMA = 1.1774  # median length of a normally distributed 2D vector over the standard deviation per axis
-_MIN_TAG_OFF_M = 5.0  # smaller distances are receiver error
+_MAX_PASS_STEPS = 3.0  # longest time between successive places of one pass over the ground, as a multiple of the median
+_MIN_COURSE_LENGTH = 0.9  # of the mean of the unit vectors along the courses, if all are in one direction
+_MAX_SIGMA = 4.0  # standard deviations per axis between a tag and the true position of its picture
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a normally distributed 2D vector, in standard deviations per axis
+_MIN_TAG_ERROR_M = 5.0  # smaller distances are normal receiver errors
 _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
 
 
@@ -35,7 +35,7 @@ _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name
 class MapInfo:
     """Summary of a map. `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees. Any field is None if no place has
     the value, or if another program wrote it in a different form. `with_position` and `with_pose` are numbers of
-    places. `of_low_quality` is the number added only to avoid too wide a gap. For the places with a pose,
+    places. `of_low_quality` is the number of places added only to close a gap. For the places with a pose,
     `footprints_m` are the lengths on the ground of a picture's longest side (see `Layers`), and `position_sd_m` is the
     standard deviation of the positions along one axis, as root mean square. `attribution` lists the owners of
     orthophotos. `one_way_deg` is the course of a nadir map that was flown in one direction: a camera that triggers late
@@ -60,16 +60,17 @@ class MapInfo:
     def one_way_warning(self) -> str:
         """A one-sentence warning about the error that a map flown in one direction cannot reveal."""
         return (
-            f"all places were flown on a course of about {self.one_way_deg:.0f} degrees: if the camera triggers late, "
-            "all positions are shifted by its delay times the speed, which only lines flown the other way would reveal"
+            f"all places were mapped on a course of about {self.one_way_deg:.0f} degrees: if the camera triggers late, "
+            "all positions are shifted by its delay times the speed; only lines in the opposite direction reveal this"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class MapIdentity:
     """Identity of a map: equal for all copies of its file, different as soon as one place differs. `map_id` is the
-    random id given at its creation (None: the file has none). `places` is their number. `sha256` covers all places
-    (positions, poses, picture names, checksums of larger values) and the table edgevpr_map, with the calibration."""
+    random id assigned at its creation (None: the file has none). `places` is the number of places. `sha256` covers all
+    places (positions, poses, picture names, checksums of larger values) and the table edgevpr_map with the
+    calibration."""
 
     map_id: str | None
     places: int
@@ -100,15 +101,15 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
 
 
 def _read_extent(place_map: PlaceMap) -> Extent | None:
-    """Return the bounding box that the file states for its places (None: it states none). Raises MapError."""
+    """Return the bounding box that the file declares for its places; None if missing or invalid. Raises MapError."""
     with translate_errors(place_map.path):
         extent = place_map.db.execute(_EXTENT).fetchone()
-    is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
-    return extent if is_extent else None
+    is_valid = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
+    return extent if is_valid else None
 
 
 def _find_one_way_deg(place_map: PlaceMap) -> float | None:
-    """Return the course over ground, degrees, if all places were flown over in about one direction; None if not, or if
+    """Return the course over ground, degrees, if all places were mapped in roughly one direction; None if not, or if
     their times are unknown."""
     tags: list[tuple[float, float, float]] = []
     with suppress(PlaceError):  # the places before a damaged one are enough
@@ -129,7 +130,7 @@ def _find_one_way_deg(place_map: PlaceMap) -> float | None:
 
 
 def read_identity(place_map: PlaceMap) -> MapIdentity:
-    """Return the identity of an open map as it is now. Raises MapError if it cannot be read.
+    """Return the current identity of an open map. Raises MapError if the map cannot be read.
 
     Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors precede
     them in the file, so they are read quickly, and change whenever a descriptor changes.
@@ -145,10 +146,10 @@ def read_identity(place_map: PlaceMap) -> MapIdentity:
     return MapIdentity(map_id if isinstance(map_id, str) else None, places, digest.hexdigest())
 
 
-def find_inconsistent_tags(moved_m: Floats) -> Bools:
+def find_inconsistent_tags(shift_m: Floats) -> Bools:
     """Return bool (N,), True for places whose recorded position is more than four standard deviations per axis from the
-    refined one. `moved_m`, float (N,): the distances in metres between the two, from whose median the standard
-    deviation is estimated."""
-    far_m = max(_MIN_TAG_OFF_M, _MAX_TAG_SIGMA * float(np.median(moved_m)) / _MEDIAN_PER_SIGMA) if len(moved_m) else 0.0
-    is_inconsistent: Bools = moved_m > far_m
+    refined one. `shift_m`, float (N,): distances in metres between the two; their median determines the standard
+    deviation."""
+    limit_m = max(_MIN_TAG_ERROR_M, _MAX_SIGMA * float(np.median(shift_m)) / _RAYLEIGH_MEDIAN) if len(shift_m) else 0.0
+    is_inconsistent: Bools = shift_m > limit_m
     return is_inconsistent

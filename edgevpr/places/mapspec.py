@@ -1,4 +1,4 @@
-"""The table edgevpr_map of a map file: it stores the format version, and the technique that made the descriptors."""
+"""The table edgevpr_map of a map file, which stores the format version and the technique that made the descriptors."""
 
 import json
 import math
@@ -20,13 +20,13 @@ _PRERELEASE_VERSION = 4  # format version in maps made before the first release;
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MAX_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
-# Keys of texts that a map may lack.
+# Keys of optional texts.
 MASK = "mask_sha256"
 LENS = "lens"
 ATTRIBUTION = "attribution"
 CALIBRATION = "calibration"
 OPTIONAL_KEYS = (MASK, LENS, ATTRIBUTION, CALIBRATION)
-_MAX_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
+_MAX_STORED = 1000  # rows read from the table, and characters of a damaged value in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
 
@@ -50,17 +50,17 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
     """Return the values of edgevpr_map by key, without `OPTIONAL_KEYS`, and check the columns of `places`. Raises
     MapError for a file that is not a place map or has an unknown format version, and sqlite3.Error."""
     (application_id,) = db.execute("PRAGMA application_id").fetchone()
-    # A view or virtual table, which has no page of its own in the file, is refused: a query of it may never end.
+    # A view or virtual table, which has no page of its own in the file, is rejected: a query of it may never end.
     tables = {name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0")}
     if application_id != geopackage.APPLICATION_ID or not {"edgevpr_map", "places"} <= tables:
-        raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
+        raise MapError(f"{path}: this is not a place map: use a .gpkg file made by `edgevpr map build`.")
     try:
-        # The optional keys are read only when they are needed: a map can be used without them.
+        # The optional keys are read only when needed: a map can be used without them.
         entries = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", OPTIONAL_KEYS)
         stored = {key: json.loads(value) for key, value in entries.fetchmany(_MAX_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:
-            raise ValueError(f"format version {version}")
+            raise ValueError(f"invalid format version {version}")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _make_damage_error(path, error) from error
     if version not in (FORMAT_VERSION, _PRERELEASE_VERSION):
@@ -80,7 +80,7 @@ def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
         if coarse is None or not isinstance(name, str) or not isinstance(model, str | None):
             raise ValueError("no coarse part, or a name that is not text")
         if not all(isinstance(value, int | str) or math.isfinite(value) for value in parameters.values()):
-            raise ValueError(f"the parameters {parameters!r}")
+            raise ValueError(f"invalid parameters {parameters!r}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise _make_damage_error(path, error) from error
     return TechniqueSpec(name=name, parameters=parameters, coarse=coarse, fine=fine, model_sha256=model, packed=packed)
@@ -98,8 +98,8 @@ def list_differences(stored: TechniqueSpec, current: TechniqueSpec) -> list[str]
 
 
 def _require_columns(path: Path, db: sqlite3.Connection) -> None:
-    """Raise MapError unless the table of places has the columns that every map has."""
-    # This list omits generated columns: they are computed when read, so their size has no limit.
+    """Raise MapError unless the table of places has all required columns."""
+    # This list omits generated columns, which are computed when read, so that their size is unlimited.
     columns = {name: (kind, key) for _, name, kind, _, _, key in db.execute("PRAGMA table_info(places)")}
     missing = [name for name in rows.ALL_COLUMNS.split(", ") if name not in columns]
     if columns.get("place_id") != ("INTEGER", 1):
@@ -121,7 +121,7 @@ def _parse_part_spec(value: Any) -> PartSpec | None:
         return None
     shape, dtype = value["shape"], value["dtype"]
     if not isinstance(shape, list) or not all(isinstance(side, int) and side > 0 for side in shape):
-        raise ValueError(f"the shape {shape!r}")
+        raise ValueError(f"invalid shape {shape!r}")
     if dtype not in _DTYPES or math.prod(shape) * np.dtype(dtype).itemsize > _MAX_PART_BYTES:
-        raise ValueError(f"a part of {shape} {dtype!r}")
+        raise ValueError(f"invalid part: {shape} {dtype!r}")
     return PartSpec(tuple(shape), dtype)

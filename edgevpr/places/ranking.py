@@ -1,4 +1,4 @@
-"""Rankings of places for a query: merging of two, and the margin of the best place over places elsewhere."""
+"""Rankings of places for a query: merging two of them, and the margin of the best place over places elsewhere."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -19,8 +19,8 @@ class Ranking:
     (K,). `compared` maps the slot of each place that was compared in full to its match, which has this score; places
     that were only scored quickly (see `Technique.score_quickly`) come last. `unread` int (U,): slots of places that
     cannot be read from the file, but that the query may show, because their scan score (see `Scan`) is at least that of
-    the best place or among the three best. `tried`: share (0..1) of the possible rotations of the query that were not
-    ruled out."""
+    the best place or among the three best. `tried`: fraction (0..1) of the possible rotations of the query that were
+    not ruled out."""
 
     slots: Ints
     scores: Singles
@@ -40,20 +40,20 @@ class Ranking:
 
 
 def merge_rankings(first: Ranking, second: Ranking) -> Ranking:
-    """Merge two rankings of the same query, made with different expectations. If both compared a place in full, the
-    better match counts."""
+    """Merge two rankings of the same query, made with different expectations. If both compared a place in full, keep
+    the better match."""
     compared = dict(first.compared)
     for slot, match in second.compared.items():
         if slot not in compared or match.score > compared[slot].score:
             compared[slot] = match
-    rest = dict[int, float]()
+    quick = dict[int, float]()
     for ranking in (first, second):
         for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
             if slot not in compared:
-                rest[slot] = max(score, rest.get(slot, score))
+                quick[slot] = max(score, quick.get(slot, score))
     scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
     lowest = min(scores.values())
-    scores |= {slot: min(rest[slot], lowest) for slot in sorted(rest, key=lambda slot: -rest[slot])}
+    scores |= {slot: min(quick[slot], lowest) for slot in sorted(quick, key=lambda slot: -quick[slot])}
     return Ranking(
         slots=np.array(list(scores), np.intp),
         scores=np.array(list(scores.values()), np.float32),
@@ -68,19 +68,19 @@ def outside_neighbourhood(
     best: int,
     slots: Ints,
     neighbour_m: float,
-    same: Collection[int] = (),
+    same_ids: Collection[int] = (),
     max_slots: int = MAX_NEIGHBOUR_SLOTS,
 ) -> Bools:
     """Return bool (K,), True for each of `slots` (K,) that is not a neighbour of the slot `best`: it is more than
-    `neighbour_m` metres or, without a position, `max_slots` slots away, and its id is not in `same`."""
+    `neighbour_m` metres or, without a position, `max_slots` slots away, and its id is not in `same_ids`."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
-    away = np.where(np.isnan(away_m), abs(slots - best) > max_slots, away_m > neighbour_m)
-    return away & ~np.isin(index.place_ids[slots], tuple(same)) if same else away
+    is_outside = np.where(np.isnan(away_m), abs(slots - best) > max_slots, away_m > neighbour_m)
+    return is_outside & ~np.isin(index.place_ids[slots], tuple(same_ids)) if same_ids else is_outside
 
 
-def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
+def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same_ids: Collection[int] = ()) -> float | None:
     """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if no such
     place is ranked."""
-    is_rival = outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)
+    is_rival = outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same_ids)
     runners_up = ranking.scores[1:][is_rival]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None

@@ -1,12 +1,12 @@
 """Retrieval of the places that a query may show: scan the whole index, then compare the best places in full.
 
-A *hypothesis* is a rotation and a camera height under which query and place may match; each has a number. A place that
-cannot be read is left out from then on. Its loss must never cause a wrong match to be accepted:
+A *hypothesis* is a rotation and a camera height at which query and place may match; hypotheses are numbered. A place
+that cannot be read is *left out* from then on. Its absence must never cause a wrong match to be accepted:
 
-* The query that reveals an unreadable place is refused.
-* A place that was left out keeps its row. A query that may show it (see `Ranking.unread`) is refused.
-* Without a fine part the row is enough: a place that was left out keeps its rank, and is refused if it is the best.
-* If most of the places compared with one query cannot be read, the file is at fault: no place is left out.
+* The query that reveals an unreadable place is rejected.
+* A place that was left out keeps its row in the index. A query that may show it (see `Ranking.unread`) is rejected.
+* Without a fine part the row suffices: a place that was left out keeps its rank, and is rejected if it is the best.
+* If most of the places compared with one query cannot be read, the file is at fault, and no place is left out.
 """
 
 import math
@@ -32,21 +32,21 @@ Scan = tuple[Singles, Singles | None]
 _RIVAL_PLACES = 5
 _MAX_HYPOTHESES = 3  # per place
 _MAX_UNMOVED_PLACES = 9
-# Factor on the candidates in a map of at least this many places, without a known heading: on the aerial sets it finds
+# Factor on the candidates in a map of at least this many places if the heading is unknown: on the aerial sets it finds
 # 0.832 of the queries among 10,000 places (0.802 without it). Twice as many find fewer among 1,000 places.
 _LARGE_MAP_PLACES = 2000
 _LARGE_MAP_FACTOR = 1.6
-_MIN_UNREADABLE = 3  # in one query: from this many on, the file may be at fault
-# In the data set corridor (tune), if the correct places were left out and a wrong one had enough margin to be accepted,
-# one of the correct ones always had at least the scan score of the wrong one, or one of the two best.
+_MIN_UNREADABLE = 3  # per query, from which on the file may be at fault
+# In the data set corridor (tune), whenever the correct places were left out and a wrong one had enough margin to be
+# accepted, one of the correct ones had at least the scan score of the wrong one, or one of the two best scores.
 _LIKELY_PLACES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What is known about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one
-    True: the places where the aircraft can be. `rotation_deg` float (N,): rotation of the camera, in degrees, since a
-    place was mapped. `height_ratio`: the camera's height above the ground, divided by the height when mapping."""
+    """Prior knowledge about the place of a query (None: unknown). `in_reach` bool (N,), at least one True: the places
+    where the aircraft can be. `rotation_deg` float (N,): rotation of the camera, in degrees, relative to that at which
+    a place was mapped. `height_ratio`: the camera's height above the ground, divided by the mapping height."""
 
     in_reach: Bools | None = None
     rotation_deg: Doubles | None = None
@@ -76,45 +76,45 @@ def scan_index(query: Query) -> Scan:
     return technique.score_places(query.descriptor, index.rows, index.mean, **hints)
 
 
-def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:
+def compare_places(query: Query, scan: Scan, candidates: int | None, apart_m: float) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
     If there are more than the technique's `max_matches`, only those with the best quick scores are compared in
     full. With a nadir camera, no heading and at least 2,000 places, `candidates` is multiplied by 1.6. All places are
-    compared if `candidates` is None, or at least the number of places and more than the technique's own number. If all
+    compared if `candidates` is None, or is at least the number of places and above the technique's default. If all
     candidates are within `apart_m` metres of the best one, those elsewhere with the best scan scores are compared too,
-    for the margin. If `expected.in_reach` is known, so are five out of reach and at least five elsewhere.
+    to obtain a margin. If `expected.in_reach` is known, so are five out of reach and at least five elsewhere.
 
-    Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the score is that of the
-    comparison times the mean of the scan score and 1. Raises PlaceError if a place cannot be read; it is then left out.
+    Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the comparison score is
+    multiplied by the mean of the scan score and 1. Raises PlaceError if a place cannot be read; it is then left out.
     Raises MapError if the file cannot be read."""
     spec, index, in_reach = query.technique.spec, query.index, query.expected.in_reach
-    comparison = _Comparison(query, scanned, candidates)
+    comparison = _Comparison(query, scan, candidates)
     readable = comparison.readable
-    likely = readable if in_reach is None else in_reach & readable
+    eligible = readable if in_reach is None else in_reach & readable
     count = candidates
     if count is None or spec.fine is None or comparison.is_exact:
         count = len(index)
     elif query.expected.rotation_deg is None:
-        count = round(count * compute_candidate_factor(bool(spec.height_ratios), int(np.count_nonzero(likely))))
-    chosen = comparison.choose_candidates(likely, count, spec.max_matches)
-    chosen += comparison.choose_candidates(readable & ~likely, _RIVAL_PLACES, spec.max_matches and _RIVAL_PLACES)
-    if not chosen:
+        count = round(count * compute_candidate_factor(bool(spec.height_ratios), int(np.count_nonzero(eligible))))
+    choices = comparison.choose_candidates(eligible, count, spec.max_matches)
+    choices += comparison.choose_candidates(readable & ~eligible, _RIVAL_PLACES, spec.max_matches and _RIVAL_PLACES)
+    if not choices:
         raise MapError(f"{query.place_map.path}: none of its places can be read: restore a copy or build it again.")
-    comparison.compare_places(chosen)
+    comparison.compare_places(choices)
     if len(comparison.scores) < np.count_nonzero(readable):
         compared = list(comparison.scores)
         best = max(compared, key=comparison.scores.__getitem__)
-        others = outside_neighbourhood(index, best, np.arange(len(index)), apart_m)
-        rivals = np.count_nonzero(others[compared])
+        is_elsewhere = outside_neighbourhood(index, best, np.arange(len(index)), apart_m)
+        rivals = np.count_nonzero(is_elsewhere[compared])
         if rivals < (1 if in_reach is None else _RIVAL_PLACES):
-            others[compared] = False
-            comparison.compare_places(comparison.choose_more(others & readable, int(_RIVAL_PLACES - rivals)))
+            is_elsewhere[compared] = False
+            comparison.compare_places(comparison.choose_more(is_elsewhere & readable, int(_RIVAL_PLACES - rivals)))
     return comparison.make_ranking()
 
 
 def compute_candidate_factor(tries_rotations: bool, places: int) -> float:
-    """Return the factor on the number of candidates in a map of `places` places, if no heading is known."""
+    """Return the factor on the number of candidates in a map of `places` places if no heading is known."""
     return _LARGE_MAP_FACTOR if tries_rotations and places >= _LARGE_MAP_PLACES else 1
 
 
@@ -123,13 +123,13 @@ class _Comparison:
     in full (without a fine part: scan scores, and no matches), and those skipped after a quick score. `readable` bool
     (N,) is False for places left out (all True without a fine part)."""
 
-    def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
+    def __init__(self, query: Query, scan: Scan, candidates: int | None) -> None:
         technique, index, expected = query.technique, query.index, query.expected
-        self._query, (self._scanned, self._every_hypothesis) = query, scanned
+        self._query, (self._scan, self._hypothesis_scores) = query, scan
         self._has_one_stage = technique.spec.fine is None
         self.is_exact = candidates is None or technique.candidates < candidates >= len(index)
         self._tries_all = self.is_exact and expected.in_reach is None and expected.rotation_deg is None
-        self._by_hypothesis = None if self._tries_all and not technique.spec.height_ratios else self._every_hypothesis
+        self._used_scores = None if self._tries_all and not technique.spec.height_ratios else self._hypothesis_scores
         self.readable = np.ones(len(index), bool)
         if not self._has_one_stage and query.place_map.left_out:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
@@ -137,34 +137,34 @@ class _Comparison:
         self.matches: dict[int, FineMatch] = {}
         self._skipped: list[QuickScore] = []
 
-    def choose_candidates(self, among: Bools, count: int, max_matches: int | None) -> list[Choice]:
-        """Choose up to `count` places where `among` bool (N,) is True, by scan score. If together they have more than
-        `max_matches` hypotheses to try, keep only that many places, by their best quick scores (None: keep all)."""
-        if self._tries_all and self._by_hypothesis is not None:
-            count = self._by_hypothesis.size
-        chosen = choose_best(self._scanned, self._by_hypothesis, among, count)
-        if self.is_exact or max_matches is None or sum(len(tried or [None]) for _, tried in chosen) <= max_matches:
-            return chosen
+    def choose_candidates(self, is_eligible: Bools, count: int, max_matches: int | None) -> list[Choice]:
+        """Choose up to `count` places by scan score where `is_eligible` bool (N,) is True. If together they have more
+        than `max_matches` hypotheses to try, keep only that many places, by best quick score (None: keep all)."""
+        if self._tries_all and self._used_scores is not None:
+            count = self._used_scores.size
+        choices = choose_best(self._scan, self._used_scores, is_eligible, count)
+        if self.is_exact or max_matches is None or sum(len(tried or [None]) for _, tried in choices) <= max_matches:
+            return choices
         quick_scores: list[QuickScore] = []
-        for slot, fine, hypotheses in _read_fine_parts(self._query, chosen):
-            score, likely = self._query.technique.score_quickly(self._query.descriptor, fine, hypotheses)
-            quick_scores.append((self._weigh_by_scan(slot, score), (slot, likely)))
+        for slot, fine, hypotheses in _read_fine_parts(self._query, choices):
+            score, best_hypotheses = self._query.technique.score_quickly(self._query.descriptor, fine, hypotheses)
+            quick_scores.append((self._weigh_by_scan(slot, score), (slot, best_hypotheses)))
         quick_scores.sort(key=lambda quick_score: -quick_score[0])
         self._skipped += quick_scores[max_matches:]
         return [choice for _, choice in quick_scores[:max_matches]]
 
-    def choose_more(self, among: Bools, count: int) -> list[Choice]:
-        """Choose up to `count` more places where `among` is True: skipped ones or, if there are none, those with the
-        best scan scores."""
-        more = [choice for _, choice in self._skipped if among[choice[0]]][:count]
-        return more or choose_best(self._scanned, self._by_hypothesis, among, count)
+    def choose_more(self, is_eligible: Bools, count: int) -> list[Choice]:
+        """Choose up to `count` more places where `is_eligible` is True: skipped ones, or if there are none those with
+        the best scan scores."""
+        skipped = [choice for _, choice in self._skipped if is_eligible[choice[0]]][:count]
+        return skipped or choose_best(self._scan, self._used_scores, is_eligible, count)
 
-    def compare_places(self, chosen: list[Choice]) -> None:
+    def compare_places(self, choices: list[Choice]) -> None:
         """Compare the chosen places in full. Raises the errors of `_read_fine_parts`."""
         if self._has_one_stage:
-            self.scores.update((slot, float(self._scanned[slot])) for slot, _ in chosen)
+            self.scores.update((slot, float(self._scan[slot])) for slot, _ in choices)
             return
-        for slot, fine, hypotheses in _read_fine_parts(self._query, chosen):
+        for slot, fine, hypotheses in _read_fine_parts(self._query, choices):
             match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
             self.scores[slot] = self._weigh_by_scan(slot, match.score)
             self.matches[slot] = replace(match, score=self.scores[slot])
@@ -174,58 +174,58 @@ class _Comparison:
         slots, scores = np.array(list(self.scores), np.intp), np.array(list(self.scores.values()), np.float32)
         order = np.argsort(-scores, kind="stable")
         slots, scores = slots[order], scores[order]
-        rest = [(score, slot) for score, (slot, _) in self._skipped if slot not in self.scores]
-        rest.sort(key=lambda scored: -scored[0])
+        skipped = [(score, slot) for score, (slot, _) in self._skipped if slot not in self.scores]
+        skipped.sort(key=lambda item: -item[0])
         unread: Ints = np.flatnonzero(~self.readable)
         if len(unread):
-            likely = min(_LIKELY_PLACES, len(self._scanned))
-            min_score = min(self._scanned[slots[0]], np.partition(self._scanned, -likely)[-likely])
-            unread = unread[self._scanned[unread] >= min_score]
+            likely = min(_LIKELY_PLACES, len(self._scan))
+            min_score = min(self._scan[slots[0]], np.partition(self._scan, -likely)[-likely])
+            unread = unread[self._scan[unread] >= min_score]
         tried = 1.0
-        if self._every_hypothesis is not None:
+        if self._hypothesis_scores is not None:
             heights = max(len(self._query.technique.spec.height_ratios), 1)
-            tried_of_slot = np.isfinite(self._every_hypothesis[slots]).mean(axis=1) * heights
-            tried = float(np.minimum(tried_of_slot, 1.0).mean())
+            tried_per_slot = np.isfinite(self._hypothesis_scores[slots]).mean(axis=1) * heights
+            tried = float(np.minimum(tried_per_slot, 1.0).mean())
         return Ranking(
-            slots=np.append(slots, [slot for _, slot in rest]).astype(np.intp),
-            scores=np.append(scores, np.minimum([score for score, _ in rest], scores[-1])).astype(np.float32),
+            slots=np.append(slots, [slot for _, slot in skipped]).astype(np.intp),
+            scores=np.append(scores, np.minimum([score for score, _ in skipped], scores[-1])).astype(np.float32),
             compared=self.matches,
             unread=unread,
             tried=tried,
         )
 
     def _weigh_by_scan(self, slot: int, score: float) -> float:
-        return score * (1 + float(self._scanned[slot])) / 2 if self._query.technique.spec.scan_counts else score
+        return score * (1 + float(self._scan[slot])) / 2 if self._query.technique.spec.scan_counts else score
 
 
-def _read_fine_parts(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
-    """Yield the slots of the chosen places with their fine parts and hypotheses. Raises PlaceError if a place cannot be
-    read, after all have been tried; it is then left out. Raises MapError if the file cannot be read."""
-    unreadable, place_map, index = [], query.place_map, query.index
-    for slot, hypotheses in chosen:
+def _read_fine_parts(query: Query, choices: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
+    """Yield the slots of the chosen places with their fine parts and hypotheses. After all have been tried, raises
+    PlaceError if one cannot be read; it is then left out. Raises MapError if the file cannot be read."""
+    failures, place_map, index = [], query.place_map, query.index
+    for slot, hypotheses in choices:
         try:
             fine, point = place_map.read_fine_part(index.place_ids[slot])
             _require_position(place_map, index, slot, point)
         except PlaceError as error:
-            unreadable.append(error)
+            failures.append(error)
         else:
             yield slot, fine, hypotheses
-    if not unreadable:
+    if not failures:
         return
-    first = unreadable[0]
-    if len(unreadable) >= _MIN_UNREADABLE and 2 * len(unreadable) > len(chosen):
+    first = failures[0]
+    if len(failures) >= _MIN_UNREADABLE and 2 * len(failures) > len(choices):
         raise MapError(
-            f"{place_map.path}: {len(unreadable)} of the {len(chosen)} places compared cannot be read (place "
-            f"{first.place_id}: {first.problem}): the file is damaged or is another map: restore a copy."
+            f"{place_map.path}: {len(failures)} of the {len(choices)} compared places cannot be read (place "
+            f"{first.place_id}: {first.problem}): the file is damaged or was replaced: restore a copy."
         )
-    for failure in unreadable:
+    for failure in failures:
         place_map.left_out.setdefault(failure.place_id, failure.problem)
     raise first
 
 
 def match_unmoved_places(query: Query, best: int, apart_m: float) -> list[FineMatch]:
-    """Compare a nadir query with a few places all over the map, but not near the slot `best`, as if it had been taken
-    at their height and heading (see `Technique.match_at_rest`). Raises the errors of `compare_places`."""
+    """Compare a nadir query with a few places spread over the map, but not near the slot `best`, as if it had been
+    taken at their height and heading (see `Technique.match_at_rest`). Raises the errors of `compare_places`."""
     index, left_out = query.index, list(query.place_map.left_out)
     slots = np.flatnonzero(
         outside_neighbourhood(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)
@@ -238,7 +238,7 @@ def load_candidates(
     ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None
 ) -> list[Candidate]:
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
-    Raises PlaceError if one of them cannot be read, was left out before, or has moved since the index was loaded. The
+    Raises PlaceError if one of them cannot be read, was left out before, or has moved since the index was loaded. That
     place is left out from then on."""
     candidates = []
     for slot, score in zip(ranking.slots[:first].tolist(), ranking.scores[:first].tolist(), strict=True):
@@ -256,22 +256,22 @@ def load_candidates(
     return candidates
 
 
-def choose_best(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
-    """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
-    (None: all), in the order of the map file, which an SD card reads fastest. With `by_hypothesis` float32 (N, H) (see
-    `Scan`), the `count` best pairs of a place and a hypothesis are chosen instead, at most three per place, or more if
-    there are too few places."""
-    slots = np.flatnonzero(among)
-    if by_hypothesis is None or not len(slots):
+def choose_best(scores: Singles, hypothesis_scores: Singles | None, is_eligible: Bools, count: int) -> list[Choice]:
+    """Choose the `count` slots with the best `scores` where `is_eligible` bool (N,) is True, each with the hypotheses
+    to try (None: all), in the order of the map file, which an SD card reads fastest. With `hypothesis_scores` float32
+    (N, H) (see `Scan`), the `count` best pairs of a place and a hypothesis are chosen instead, at most three per place,
+    or more if there are too few places."""
+    slots = np.flatnonzero(is_eligible)
+    if hypothesis_scores is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_find_largest(scores[slots], count))].tolist()]
-    slots = slots[np.sort(_find_largest(by_hypothesis.max(axis=1)[slots], count))]
-    pairs = by_hypothesis[slots]
+    slots = slots[np.sort(_find_largest(hypothesis_scores.max(axis=1)[slots], count))]
+    pairs = hypothesis_scores[slots]
     rank_in_place = np.argsort(np.argsort(-pairs, axis=1, kind="stable"), axis=1)
     pairs = np.where(rank_in_place < max(_MAX_HYPOTHESES, count // len(slots)), pairs, -np.inf)
-    tried = np.zeros(pairs.shape, bool)
-    tried.flat[_find_largest(pairs.ravel(), count)] = True
-    tried &= np.isfinite(pairs)
-    return [(int(slots[row]), np.flatnonzero(tried[row]).tolist()) for row in np.flatnonzero(tried.any(axis=1))]
+    is_tried = np.zeros(pairs.shape, bool)
+    is_tried.flat[_find_largest(pairs.ravel(), count)] = True
+    is_tried &= np.isfinite(pairs)
+    return [(int(slots[row]), np.flatnonzero(is_tried[row]).tolist()) for row in np.flatnonzero(is_tried.any(axis=1))]
 
 
 def _find_largest(scores: Singles, count: int) -> Ints:
@@ -280,7 +280,7 @@ def _find_largest(scores: Singles, count: int) -> Ints:
 
 
 def _require_position(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
-    """Raise PlaceError unless `point`, the position in the file, is that in the index (None: no position)."""
+    """Raise PlaceError unless `point`, the position in the file, equals that in the index (None: no position)."""
     lat_deg = float(index.lat_deg[slot])
     if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:
         raise PlaceError(place_map.path, int(index.place_ids[slot]), "its position has changed")

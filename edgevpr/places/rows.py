@@ -1,7 +1,7 @@
 """The rows of the table of places: their columns, the check of their values, and a scan that survives damaged pages.
 
 A row is used only if each value has the right type and range, and each BLOB the right size and checksum. A missing
-checksum (NULL) is accepted, since a program that moves a place on purpose removes it. The exception is the time, which
+checksum (NULL) is accepted, because it is removed when a place is moved on purpose. The exception is the time, which
 other programs write in many formats: a value that is not a time is treated as unknown.
 """
 
@@ -37,7 +37,7 @@ MAX_LANDMARK_BYTES = 10_000  # per place
 _POSE = tuple(POSE.split(", "))
 _ALTITUDES_M = (-1000, 100_000)  # above sea level, as in positions.csv
 _VARIANCES_M2 = (1e-12, 1e10)
-_RANGES: dict[str, tuple[float, float]] = {  # smallest and largest number of a column
+_RANGES: dict[str, tuple[float, float]] = {  # minimum and maximum of a column
     "alt_m": _ALTITUDES_M,
     "quality": (0, 1),
     "footprint_m": (1e-6, 1e5),
@@ -48,7 +48,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # smallest and largest number of a 
 }
 _MAX_UNREADABLE = 100_000  # a scan ends after this many successive ids without a readable place
 
-# Values of some columns of a row as SQLite returns them; their types are not checked yet.
+# Values of some columns of a row as SQLite returns them, with unchecked types.
 Values = tuple[Any, ...]
 Content = Mapping[str, Any]  # such values by column name
 
@@ -58,7 +58,7 @@ class RowError(ValueError):
 
 
 def read_columns(columns: str, row: Values | None) -> Content:
-    """Return the values of a row by the names in `columns`, of the form "a, b". Raises RowError if it is None."""
+    """Return the values of a row by the names in `columns` ("a, b"). Raises RowError if the row is None."""
     if row is None:
         raise RowError("its row is missing")
     return dict(zip(columns.split(", "), row, strict=True))
@@ -161,15 +161,15 @@ def make_pose_content(pose: Pose | None) -> Content:
     """Return the columns `POSE` of a row, all None for an unknown pose."""
     if pose is None:
         return dict.fromkeys(_POSE)
-    recorded = (pose.recorded.lat_deg, pose.recorded.lon_deg) if pose.recorded else (None, None)
-    measured = (pose.up_deg, pose.footprint_m, *pose.covariance_m2)
-    return dict(zip(_POSE, (*map(float, measured), int(pose.is_surveyed), *recorded), strict=True))
+    recorded_deg = (pose.recorded.lat_deg, pose.recorded.lon_deg) if pose.recorded else (None, None)
+    numbers = (pose.up_deg, pose.footprint_m, *pose.covariance_m2)
+    return dict(zip(_POSE, (*map(float, numbers), int(pose.is_surveyed), *recorded_deg), strict=True))
 
 
 def compute_checksums(content: Content) -> dict[str, int | None]:
     """Return the columns `CHECKSUMS` of a row. The checksum of a value that is None is None."""
-    sums = {f"{name}_crc32": compute_crc32(content[name]) for name in ("geom", "coarse", "fine", "landmarks")}
-    return sums | {"pose_crc32": compute_pose_crc32([content[name] for name in _POSE])}
+    checksums = {f"{name}_crc32": compute_crc32(content[name]) for name in ("geom", "coarse", "fine", "landmarks")}
+    return checksums | {"pose_crc32": compute_pose_crc32([content[name] for name in _POSE])}
 
 
 def compute_pose_crc32(values: Sequence[Any]) -> int | None:
@@ -185,7 +185,7 @@ def escape_name(name: str) -> str:
 
 
 def scan_rows(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
-    """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read.
+    """Yield (place id, values of `columns`) of every place in insertion order; None for values that SQLite cannot read.
     After a damaged page, each place is read by its id. Raises sqlite3.Error if nothing can be read."""
     last = -(2**63)
     try:
@@ -215,7 +215,7 @@ def scan_rows(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Value
 
 
 def _find_highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
-    """Return the highest id of a damaged file. Raises `error`, which showed the damage, if that cannot be read."""
+    """Return the highest id in a damaged file. Raises `error`, which revealed the damage, if that cannot be read."""
     for query in ("SELECT max(place_id) FROM places", "SELECT seq FROM sqlite_sequence WHERE name = 'places'"):
         with suppress(sqlite3.Error):
             (highest,) = db.execute(query).fetchone() or (None,)
@@ -235,7 +235,7 @@ def _make_salience(values: Sequence[Any]) -> Salience | None:
 
 
 def _make_pose(content: Content) -> Pose | None:
-    """Make a Pose from the columns `POSE`; None if unknown. Raises RowError: a wrong pose would shift fixes."""
+    """Make a Pose from the columns `POSE`; None if unknown. Raises RowError, because a wrong pose would shift fixes."""
     values, checksum = [_parse_number(content, name) for name in _POSE], content["pose_crc32"]
     if checksum is not None and checksum != compute_pose_crc32(values):
         raise RowError("its pose does not match its checksum")
@@ -256,7 +256,7 @@ def _make_pose(content: Content) -> Pose | None:
 
 
 def _encode_part(part: Array | None, spec: PartSpec | None) -> bytes | None:
-    """Encode a part of a descriptor as the bytes to store; None for a part that the technique does not have."""
+    """Encode a part of a descriptor as bytes to store; None for a part that the technique does not have."""
     if spec is None or part is None:
         return None
     return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
@@ -273,7 +273,7 @@ def _require_checksum(content: Content, name: str, label: str) -> None:
 
 
 def _parse_number(content: Content, name: str) -> float | None:
-    """Return the number in a column, None for NULL. Raises RowError for anything else, or one out of its range."""
+    """Return the number in a column, None for NULL. Raises RowError for any other type or a number out of range."""
     value, (low, high) = content[name], _RANGES.get(name, (-math.inf, math.inf))
     if value is None or (isinstance(value, (int, float)) and math.isfinite(value) and low <= value <= high):
         return value

@@ -2,7 +2,7 @@
 
 This is the trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to 6), applied to the scores of any
 technique. A trajectory assigns a slot of the index to each of the last queries, at a constant speed of 0.8 to 1.2
-places per query: places must be mapped in the order of the flight. At another speed, or backwards, the search finds
+places per query, so places must be mapped in the order of the flight. At another speed, or backwards, the search finds
 places that lag behind. So trajectories at other speeds (-2.5 to 3) are scored as well, and a place is accepted only if
 it scores higher than these *rivals* at all places elsewhere."""
 
@@ -16,15 +16,15 @@ from edgevpr.core.arrays import Bools, Floats, Singles
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.ranking import Ranking
 
-FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
+_SEARCH_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
 _SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can distinguish steps of 0.25
-_OTHER_SPEEDS = _SPEEDS[(FOLLOWED_SPEEDS[0] > _SPEEDS) | (FOLLOWED_SPEEDS[-1] < _SPEEDS)]
+_OTHER_SPEEDS = _SPEEDS[(_SEARCH_SPEEDS[0] > _SPEEDS) | (_SEARCH_SPEEDS[-1] < _SPEEDS)]
 # After 5 s at 10 m/s the vehicle has left the 50 m neighbourhood, and no trajectory covers the places in between.
 _MAX_PAUSE_S = 5.0
 _MAX_PAUSE_INTERVALS = 3  # a slow board may need longer for each query, such as 6 s
-_MIN_QUERIES_TOGETHER = 3
-_MIN_QUERIES_ALONE = 2
-_MAX_BETTER_SHARE = 0.1
+_MIN_QUERIES_AVERAGED = 3
+_MIN_QUERIES_SINGLE = 2
+_MAX_BETTER_FRACTION = 0.1
 
 
 def make_sequence_search(length: int) -> "SequenceSearch | None":
@@ -34,7 +34,7 @@ def make_sequence_search(length: int) -> "SequenceSearch | None":
 
 
 def compute_sequence_bytes(length: int) -> int:
-    """Return the bytes of RAM that a sequence needs per place: a float32 score per query, and one for the rivals."""
+    """Return the bytes of RAM that a sequence needs per place: a float32 score per query and one for the rivals."""
     return 4 * (length + 1) if length > 1 else 0
 
 
@@ -48,11 +48,11 @@ class SequenceSearch:
 
     def __init__(self, length: int) -> None:
         self.length = length
-        self._trajectories = make_trajectories(length, FOLLOWED_SPEEDS)
+        self._trajectories = make_trajectories(length, _SEARCH_SPEEDS)
         self._other_trajectories = make_trajectories(length, _OTHER_SPEEDS)
         self.rivals: Singles = np.empty(0, np.float32)
         self._rows: deque[Singles] = deque(maxlen=length)  # newest first
-        self._default_scores: deque[float] = deque(maxlen=_MIN_QUERIES_ALONE)  # score of places not compared, per query
+        self._default_scores: deque[float] = deque(maxlen=_MIN_QUERIES_SINGLE)  # of places not compared, per query
         self._t_last_s: float | None = None
         self._interval_s = 0.0
 
@@ -62,14 +62,14 @@ class SequenceSearch:
         return len(self._rows)
 
     def add_query(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
-        """Add the ranking of the newest query, made at `t_mono_s` (monotonic seconds). Return a ranking of the places
+        """Add the ranking of the newest query, taken at `t_mono_s` (monotonic seconds). Return a ranking of the places
         by the mean score of their best trajectory, with the matches of the newest query. A place that was not compared
         gets the median score of those that were (0 would score rivals too low); slots before the first place of the map
         score 0."""
         if self._is_broken(t_mono_s):
             self._rows.clear()
         if self.frames == self.length:
-            self._rows.pop()  # before the next one is added
+            self._rows.pop()  # frees its memory before the next row is allocated
         default_score = float(np.median(ranking.scores)) if len(ranking.slots) < len(index) else 0.0
         self._default_scores.appendleft(default_score)
         row = np.full(len(index), default_score, np.float32)
@@ -88,18 +88,18 @@ class SequenceSearch:
         """Return True if the newest queries alone still agree with the sequence, whose mean score stays high for a
         while after a vehicle has left the mapped track.
 
-        `near` bool (N,) is True in the neighbourhood of the sequence's best place. The best place of the last three
-        queries together must be in `near`. And for each of the last two, the best score in `near` must be at least
-        `min_score`, and so high that at most a tenth of all neighbourhoods would reach it."""
-        newest = list(self._rows)[:_MIN_QUERIES_TOGETHER]
-        together = find_best_means(newest, [trajectory[:_MIN_QUERIES_TOGETHER] for trajectory in self._trajectories])
-        if not near[together.argmax()]:
+        `near` bool (N,) is True in the neighbourhood of the sequence's best place. The place with the best mean score
+        over the last three queries must be in `near`. And for each of the last two, the best score in `near` must be at
+        least `min_score`, and so high that at most a tenth of all neighbourhoods would reach it."""
+        newest = list(self._rows)[:_MIN_QUERIES_AVERAGED]
+        means = find_best_means(newest, [trajectory[:_MIN_QUERIES_AVERAGED] for trajectory in self._trajectories])
+        if not near[means.argmax()]:
             return False
-        for row, default_score in zip(newest[:_MIN_QUERIES_ALONE], self._default_scores, strict=False):
+        for row, default_score in zip(newest[:_MIN_QUERIES_SINGLE], self._default_scores, strict=False):
             best = float(row[near].max(initial=0))
-            # The default score, that of places not compared, would reach a `min_score` of 0.
-            better = np.count_nonzero(row > best)
-            if best <= default_score or best < min_score or better * near.sum() > _MAX_BETTER_SHARE * len(row):
+            # The default score, which places that were not compared have, would reach a `min_score` of 0.
+            better_count = np.count_nonzero(row > best)
+            if best <= default_score or best < min_score or better_count * near.sum() > _MAX_BETTER_FRACTION * len(row):
                 return False
         return True
 
@@ -116,9 +116,9 @@ class SequenceSearch:
 def make_trajectories(length: int, velocities: Floats) -> list[list[int]]:
     """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates: for
     each query, newest first, its distance in slots from the newest query, such as [0, 1, 2, ...] at a velocity of 1."""
-    # Round halves up, even if the product has a rounding error in its last bit.
-    back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
-    unique: list[list[int]] = np.unique(back, axis=0).tolist()
+    # Round halves up, even if the product has a rounding error in the last bit.
+    lag = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
+    unique: list[list[int]] = np.unique(lag, axis=0).tolist()
     return unique
 
 
@@ -128,10 +128,10 @@ def find_best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])
     for trajectory in trajectories:
         total[:] = 0
-        for row, back in zip(rows, trajectory, strict=False):
-            first, last = max(0, -back), min(len(total), len(total) - back)
+        for row, lag in zip(rows, trajectory, strict=False):
+            first, last = max(0, -lag), min(len(total), len(total) - lag)
             if first < last:
-                total[first + back : last + back] += row[first:last]
+                total[first + lag : last + lag] += row[first:last]
         np.maximum(best, total, out=best)
     best /= len(rows)
     return best

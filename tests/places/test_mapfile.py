@@ -171,7 +171,7 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
     [
         ("geom = x'4750000100'", "its geometry is not a point"),
         ("geom_crc32 = geom_crc32 + 1", "its position does not match its checksum"),
-        (f"geom = x'{encode_point(50.0, 8.0).hex().replace('e6100000', '110f0000')}'", "in the reference system 3857"),
+        (f"geom = x'{encode_point(50.0, 8.0).hex().replace('e6100000', '110f0000')}'", "in reference system 3857"),
         (f"coarse = x'{'00' * 126}007c', coarse_crc32 = NULL", "its coarse part is not finite"),
         (f"coarse = x'{'00' * 128}'", "its coarse part does not match its checksum"),
         ("coarse = x'00'", "its coarse part has the wrong size"),

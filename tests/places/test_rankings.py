@@ -90,5 +90,5 @@ def test_promote_moves_a_place_to_the_front():
 def test_elsewhere_is_beyond_the_two_beside_and_not_of_the_same_places():
     index, slots = index_of(range(10, 17)), np.arange(7)
     assert outside_neighbourhood(index, 3, slots, 50.0).tolist() == [True, False, False, False, False, False, True]
-    assert outside_neighbourhood(index, 3, slots, 50.0, same=(10,)).tolist() == [False] * 6 + [True]
+    assert outside_neighbourhood(index, 3, slots, 50.0, same_ids=(10,)).tolist() == [False] * 6 + [True]
     assert outside_neighbourhood(index, 3, slots, 50.0, max_slots=3).tolist() == [False] * 7
