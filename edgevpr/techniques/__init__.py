@@ -1,6 +1,6 @@
 """Registry of the place-recognition techniques: their names, their parameters, and a function that creates one.
 
-Map building, flights and evaluations create every technique here; its module is imported only then. "The thesis" is
+Map building, flights and evaluations create every technique here, and its module is imported only then. "The thesis" is
 Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. A card is a YAML file that describes a network.
 """
 
@@ -78,13 +78,13 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
         if key not in defaults:
             hint = suggest(key, defaults, f"it has {', '.join(defaults)}.")
             if key == "camera":
-                hint = "it works with every camera direction: leave out --camera."
+                hint = "it works with every camera direction: omit --camera."
             raise UsageError(f"{name} has no parameter `{key}`: {hint}")
-        kind = type(defaults[key])
+        value_type = type(defaults[key])
         try:
-            values[key] = kind(value)
+            values[key] = value_type(value)
         except ValueError:
-            raise UsageError(f"{name}: `{key}` is {value!r}; it must be {_TYPE_NAMES[kind]}.") from None
+            raise UsageError(f"{name}: `{key}` is {value!r}, but must be {_TYPE_NAMES[value_type]}.") from None
     technique: Technique = _find_factory(name)(**values)
     return technique
 

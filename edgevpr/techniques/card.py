@@ -1,4 +1,4 @@
-"""The card of a network: a YAML file that describes the weights, the preparation of a picture, and the outputs.
+"""The card of a network: a YAML file that describes its weights, the preparation of a picture, and its outputs.
 Techniques, training and the salience gate use it. Errors in a card are reported when it is read, not in flight."""
 
 import hashlib
@@ -23,9 +23,9 @@ _KEYS_ADDED_LATER = ("pad", "boxes", "memorability")  # see `_drop_unused_keys`
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputRule:
     """Preparation of a picture for the network: (pixel * `scale` - `mean`) / `std` (None: 1). `mean` and `std` are one
-    number, or one per channel. With `equalise`, the histogram of the brightness is equalised first. The picture is
-    stretched to `height` x `width` with the interpolation `resize`. With `pad`, a grey level, it keeps its aspect ratio
-    in the upper left corner, and the rest has that level. `layout`, NCHW, is the order of axes."""
+    number, or one per channel. With `equalise`, the brightness histogram is equalised first. The picture is stretched
+    to `height` x `width` with the interpolation `resize`. If `pad`, a grey level, is set, the picture keeps its aspect
+    ratio in the upper left corner, and the rest is filled with that level. `layout`, NCHW, is the order of axes."""
 
     layout: str
     height: int = bounded_key(8, 4096)
@@ -54,8 +54,8 @@ class Outputs:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorRule:
     """How the `boxes` of an object detector are decoded: with the decoder of its `family`. `dynamic` maps the classes
-    of movable objects, such as cars, to their numbers in the outputs. Boxes that score below `min_score` do not
-    count."""
+    of movable objects, such as cars, to their indices in the outputs. Boxes that score below `min_score` are
+    ignored."""
 
     family: str = key(choices=("yolox", "fastestdet"))
     dynamic: dict[str, int]
@@ -65,7 +65,7 @@ class DetectorRule:
 @dataclass(frozen=True, kw_only=True)
 class Card:
     """The description of one network, read from a YAML file. `path` is the YAML file; `file` and `sha256` are the name
-    and hash of the ONNX file in the same folder. `similarity` is the measure by which its descriptors are compared."""
+    and hash of the ONNX file in the same folder. `similarity` is the measure used to compare its descriptors."""
 
     path: Path
     title: str
@@ -119,7 +119,7 @@ def load_card(name: str) -> Card:
     if path := find_model(f"{name}.yaml"):
         try:
             return read_card(path)
-        except ConfigError as error:  # the network cannot be used, but the user's request was right
+        except ConfigError as error:  # the card is at fault, not the user's request
             raise ModelError(str(error)) from error
     names = ", ".join(list_cards()) or "none"
     hint = suggest(name, list_cards(), f"the cards in your models folder and the shipped one are: {names}.")
@@ -128,7 +128,7 @@ def load_card(name: str) -> Card:
 
 def describe_weights(spec: TechniqueSpec) -> str | None:
     """Return one line that describes the weights of a technique: name, title, licence and source of the network's card;
-    None if it has no network."""
+    None if the technique has no network."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))
@@ -144,32 +144,32 @@ def read_card(path: Path) -> Card:
 
 
 def _find_problems(card: Card) -> Iterator[str]:
-    """Yield a sentence for each fault that the checks of types and ranges cannot find, with its remedy."""
+    """Yield a sentence with a remedy for each fault that the checks of types and ranges cannot find."""
     boxes, rule, channels = card.outputs.boxes, card.detector, 1 if card.input.colour == "grey" else 3
-    per_channel = f"write one number or {channels}, one per channel"
+    per_channel = f"but must be one number or {channels}, one per channel"
     if not re.fullmatch("[0-9a-f]{64}", card.sha256):
         yield f"`sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints."
     if card.input.layout != "NCHW":
-        yield f"`input.layout` is `{card.input.layout:.20}`: export the network again with its axes in the order NCHW."
+        yield f"`input.layout` is `{card.input.layout:.20}`, but must be NCHW: export the network with that axis order."
     if card.file in ("", ".", "..") or "/" in card.file:
-        yield f"`file` is `{card.file}`: write the name of a file in the same folder as the card."
+        yield f"`file` is `{card.file}`, but must be the name of a file in the same folder as the card."
     if card.file.lower().endswith((".yaml", ".yml")):
-        yield f"`file` is `{card.file}`, which is the name of a card: write the name of the ONNX file."
+        yield f"`file` is `{card.file}`, which is the name of a card, but must be that of the ONNX file."
     if not any(asdict(card.outputs).values()):
-        yield "`outputs` is empty: write the ONNX output of `descriptor`, `features`, `boxes` or `memorability`."
+        yield "`outputs` must name an ONNX output as `descriptor`, `features`, `boxes` or `memorability`."
     if (boxes is None) != (rule is None):
-        yield "a detector needs both `outputs.boxes` and the section `detector`: write both."
+        yield "a detector needs both `outputs.boxes` and the section `detector`: add the missing one."
     if boxes is not None and not (boxes and all(isinstance(name, str) for name in boxes)):
-        yield f"`outputs.boxes` is {boxes!s:.80}: write the names of ONNX outputs."
-    numbers = [0] if rule is None else list(rule.dynamic.values())
-    if not numbers or not all(type(number) is int and 0 <= number < 10_000 for number in numbers):
-        yield "`detector.dynamic` must map class names to class numbers, such as {car: 2}."
+        yield f"`outputs.boxes` is {boxes!s:.80}, but must be a list of names of ONNX outputs."
+    indices = [0] if rule is None else list(rule.dynamic.values())
+    if not indices or not all(type(index) is int and 0 <= index < 10_000 for index in indices):
+        yield "`detector.dynamic` must map class names to class indices, such as {car: 2}."
     if not _are_per_channel(card.input.mean, channels, -1e9):
-        yield f"`input.mean` is {card.input.mean!s:.80}: {per_channel}."
+        yield f"`input.mean` is {card.input.mean!s:.80}, {per_channel}."
     if card.input.std is not None and not _are_per_channel(card.input.std, channels, 0):
-        yield f"`input.std` is {card.input.std!s:.80}: {per_channel}, all above 0."
+        yield f"`input.std` is {card.input.std!s:.80}, {per_channel}, all above 0."
 
 
-def _are_per_channel(values: list[float], channels: int, above: float) -> bool:
-    """Return True if `values` has one number or one per channel, all larger than `above` and less than 1e9."""
-    return len(values) in (1, channels) and all(type(value) in (int, float) and above < value < 1e9 for value in values)
+def _are_per_channel(values: list[float], channels: int, low: float) -> bool:
+    """Return True if `values` has one number or one per channel, all above `low` and below 1e9."""
+    return len(values) in (1, channels) and all(type(value) in (int, float) and low < value < 1e9 for value in values)

@@ -2,8 +2,8 @@
 
 A place is 31x31 overlapping blocks, also called regions, each described by the histograms of its 2x2 cells. A query
 uses only its *good* blocks, those of high entropy. Each of them is matched to its most similar block of the place. In
-the thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for
-the displacement of the image. docs/explanation/how-cohog-matches.md explains every step of the score.
+the thesis the score is the mean of their cosines (`matching: thesis`). Here, by default, each good block also votes for
+a displacement of the image. docs/explanation/how-cohog-matches.md explains every step of the score.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
 places that are compared in full (see `placecode` and, for a nadir camera, which looks straight down, `layout`).
@@ -30,7 +30,7 @@ from edgevpr.techniques import cohog_tuning as tuning
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretch_contrast
 from edgevpr.techniques.displacement import (
-    compute_vote_share,
+    compute_vote_fraction,
     find_most_similar,
     fit_alignment,
     locate_regions,
@@ -60,8 +60,8 @@ class CoHog:
     does not record it.
 
     With `camera` "nadir" the image is padded to a square, not stretched, so that a rotated image shows the same
-    ground. A query is tried under hypotheses: five heights (one if `matching` is "thesis") with 24 rotations each (see
-    `views`)."""
+    ground. A query is compared under several hypotheses: five heights (one if `matching` is "thesis") with 24 rotations
+    each (see `views`)."""
 
     w1: int = 512
     w2: int = 16
@@ -77,7 +77,7 @@ class CoHog:
             self.gt = tuning.DEFAULT_GT[self.entropy]
         self._side = self.w1 // self.w2 - 1  # blocks along one side
         self._is_nadir, self._votes = self.camera == "nadir", self.matching == "displacement"
-        finds_height = self._is_nadir and self._votes  # the thesis's score cannot distinguish two heights
+        finds_height = self._is_nadir and self._votes  # the thesis's score cannot distinguish heights
         self.min_score, self.min_margin = tuning.ACCEPT_LIMITS[self.camera if self._votes else "thesis"]
         self.min_quality = tuning.MIN_QUALITY[self.entropy]
         self.candidates = tuning.CANDIDATES[self.camera]
@@ -120,13 +120,13 @@ class CoHog:
                 f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
         if self.camera == "nadir" and bins != tuning.NADIR_BINS:
-            raise UsageError(f"cohog with `camera` nadir uses {tuning.NADIR_BINS} bins, not {bins}: leave `bins` out.")
+            raise UsageError(f"cohog with `camera` nadir uses {tuning.NADIR_BINS} bins, not {bins}: omit `bins`.")
         if self.gt > 1:
-            raise UsageError(f"cohog: gt is {self.gt:g}; it must be a share of the largest entropy, 0 to 1.")
+            raise UsageError(f"cohog: gt is {self.gt:g}, but must be a fraction of the largest entropy, 0 to 1.")
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
-        """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good. A dim
-        image is stretched first (see `contrast`).
+        """Encode uint8 (H, W[, 3]); a block that contains a pixel where `mask` bool (H, W) is False is never good. The
+        contrast of a dim image is stretched first (see `contrast`).
 
         Returns coarse uint8 (12, 12, bins), or uint8 (1120,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
         float32 (blocks, 4 bins) and good bool (blocks,): the rows of matrix A of thesis 6.2.3."""
@@ -137,7 +137,7 @@ class CoHog:
         grey = stretch_contrast(grey, allowed, pixel_px, *tuning.CONTRAST[self.camera])
         blocks, seen, good = self._make_good_blocks(grey, allowed, self.w2)
         regions = blocks.reshape(-1, 4 * self.bins)
-        # Store square roots in 8 bits: most values are small, and their roots lose less precision.
+        # Store square roots in 8 bits: most values are small, and square roots preserve their precision better.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._is_nadir:
             # In float64, so that the layout is rounded to the same values on every processor.
@@ -152,10 +152,10 @@ class CoHog:
 
     def _make_good_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
         """Describe a square image, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
-        4 bins); bool (n, n), True for seen blocks, those on `allowed` pixels only; and bool (n, n), True for good
+        4 bins); bool (n, n), True for seen blocks, which have only `allowed` pixels; and bool (n, n), True for good
         blocks: seen ones whose entropy is at least `gt`."""
         blocks, seen = self._make_blocks(grey, allowed, cell_px)
-        return blocks, seen, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, among=seen)
+        return blocks, seen, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, eligible=seen)
 
     def _make_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
         """Return the first two results of `_make_good_blocks`."""
@@ -178,7 +178,7 @@ class CoHog:
         height_ratio: float | None = None,
         in_reach: Bools | None = None,
     ) -> tuple[Singles, Singles | None]:
-        """Score all places; for the arguments see `Technique.score_places`. With a forward camera `rows` are place
+        """Score all places; for the arguments, see `Technique.score_places`. With a forward camera `rows` are place
         codes uint8 (N, B), compared under shifts. With a nadir camera they are layouts uint8 (N, 1120), compared at the
         one of five heights that is nearest to `height_ratio`. Returns scores float32 (N,) in 0..1 and, with a nadir
         camera, the score of each hypothesis, float32 (N, 120): 24 rotations at each height, -inf if not tried."""
@@ -203,21 +203,21 @@ class CoHog:
         fields = self._make_views(query).fields
         if (number, grid.side) not in fields:
             view = self._make_views(query).make_regions(number, self._make_patterns)
-            fields[number, grid.side] = layout.make_field(grid, view.regions, view.numbers, (view.side, self._side))
+            fields[number, grid.side] = layout.make_field(grid, view.regions, view.indices, (view.side, self._side))
         return fields[number, grid.side]
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
-        """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
-        regions of the query and B those of the place, then the score according to `matching` (0 without a good region).
-        A nadir query is tried under `hypotheses` (None: all); the one with the highest score counts, and
-        `fit_alignment` refines its shift, rotation and height. Finally, the score is lowered if the structures of the
-        two images agree poorly (see `overlay`)."""
+        """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), where A are the
+        good regions of the query and B those of the place, then the score according to `matching` (0 without a good
+        region). A nadir query is compared under `hypotheses` (None: all); `fit_alignment` refines shift, rotation and
+        height of the one with the highest score. Finally, the score is reduced if the structures of the two images
+        agree poorly (see `overlay`)."""
         reference = self._restore_regions(fine)
         if self._is_nadir:
             best, match, nearest = self._find_best_hypothesis(query, reference, hypotheses)
             if self._votes:
                 view = self._make_view(query, best)
-                match = fit_alignment((view.numbers, view.side), (nearest, self._side), match)
+                match = fit_alignment((view.indices, view.side), (nearest, self._side), match)
         else:
             match, _ = self._match_view(self._make_view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
@@ -242,7 +242,7 @@ class CoHog:
         nearest = find_most_similar(view.regions, self._restore_regions(fine))
         scale, offset_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
         fit = fit_perspective(
-            locate_regions(view.numbers, view.side),
+            locate_regions(view.indices, view.side),
             locate_regions(nearest, self._side),
             complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(offset_deg))),
             complex(*(match.shift_cells or (0.0, 0.0))),
@@ -258,18 +258,18 @@ class CoHog:
         return Perspective(place_from_query, cells * sd, regions)
 
     def match_at_rest(self, query: Descriptor, fine: Bytes) -> FineMatch:
-        """See `Technique.match_at_rest`."""
+        """See `Technique.match_at_rest`: compare only at the place's own height and heading."""
         return self._find_best_hypothesis(query, self._restore_regions(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
 
     def _find_best_hypothesis(
         self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None
     ) -> tuple[int, FineMatch, Ints]:
-        """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the one with the
-        highest score, its match, and the most similar region of the place for each region of this view."""
+        """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the hypothesis with
+        the highest score, its match, and for each region of this view the most similar region of the place."""
         place = None
         if self._votes:
-            numbers = np.flatnonzero(reference.any(axis=1))
-            place = layout.make_field(layout.FINE, reference[numbers], numbers, (self._side, self._side))
+            indices = np.flatnonzero(reference.any(axis=1))
+            place = layout.make_field(layout.FINE, reference[indices], indices, (self._side, self._side))
         matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
         for number in self._hypotheses if hypotheses is None else hypotheses:
             match, nearest[number] = self._match_view(self._make_view(query, number), reference)
@@ -284,8 +284,8 @@ class CoHog:
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
 
     def _measure_agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
-        """Overlay a query on a place according to their `match` (see `overlay`); `reference` are the regions of the
-        place. Returns the agreement of their structures or, with a nadir camera, its prominence."""
+        """Overlay a query on a place according to their `match` (see `overlay`); `reference`: regions of the place.
+        Returns the agreement of their structures or, with a nadir camera, its prominence."""
         views, cells = self._make_views(query), self._side + 1
         is_known = reference.any(axis=1).reshape(self._side, self._side)
         place = overlay.compute_structure(reference, is_known, tuning.SURROUND_SD_CELLS[self.camera])
@@ -315,12 +315,12 @@ class CoHog:
             return match.score, [best]
         view = self._make_view(query, self._hypotheses[0])
         nearest = find_most_similar(view.regions[:: tuning.QUICK_STEP], reference)
-        return compute_vote_share(
-            view.numbers[:: tuning.QUICK_STEP], nearest, (view.side, self._side), tuning.VOTE_WEIGHTS[self.camera]
+        return compute_vote_fraction(
+            view.indices[:: tuning.QUICK_STEP], nearest, (view.side, self._side), tuning.VOTE_WEIGHTS[self.camera]
         ), None
 
     def _restore_regions(self, fine: Bytes) -> Singles:
-        """Restore the vectors to compare from the `fine` part of a place, which stores square roots of blocks."""
+        """Restore the vectors to compare from the `fine` part of a place, which stores the square roots of blocks."""
         return self._make_vectors(np.square(fine, dtype=np.float32))
 
     def _make_view(self, query: Descriptor, number: int) -> ViewRegions:

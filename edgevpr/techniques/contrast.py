@@ -1,6 +1,6 @@
 """Stretches the contrast of pictures taken in low light or fog, for `cohog`.
 
-Dim ground has as little entropy as a blank wall. Such a picture is smoothed, since stretching amplifies sensor noise,
+Dim ground has as little entropy as a blank wall. Such a picture is smoothed, because stretching amplifies sensor noise,
 and then *stretched* to more grey levels. A picture with enough contrast, or almost none, is left unchanged: noise must
 not look like ground. Results are rounded identically on every processor (see `gradients`): means of integer grey levels
 are exact, and products and sums are computed one by one."""
@@ -14,12 +14,12 @@ from edgevpr.core.arrays import Array, Mask, Singles
 from edgevpr.techniques.gradients import round_levels
 
 _BLOCKS_PER_SIDE = 64  # the contrast is measured on means of blocks, which have little noise
-_CLIPPED_SHARE = 0.01  # of the blocks, at the dark end and at the bright end each
-# Minimum contrast of ground, in grey levels. If a block has few pixels, noise of 3 levels raises it.
+_CLIPPED_FRACTION = 0.01  # of the blocks, at the dark and at the bright end
+# Minimum contrast of ground, in grey levels. If blocks have few pixels, the noise of 3 levels raises this minimum.
 _MIN_CONTRAST_LEVELS = 4.0
-_NOISE_LEVELS = 3 * 4.65  # from the 1st to the 99th percentile of a normal distribution
+_NOISE_LEVELS = 3 * 4.65  # 3 levels, from the 1st to the 99th percentile of a normal distribution
 _MAX_SIGMA_PIXELS = 1.4
-_SMOOTHING_ROUNDS = 4  # fewer cannot reach `_MAX_SIGMA_PIXELS`
+_SMOOTHING_ROUNDS = 4  # fewer rounds cannot reach `_MAX_SIGMA_PIXELS`
 
 
 def stretch_contrast(
@@ -35,9 +35,9 @@ def stretch_contrast(
     by `sigma_pixels`, in pixels of the original picture.
 
     Contrast is the range of the mean grey levels of small blocks, without the darkest and the brightest 1 %. Only
-    blocks of `allowed` pixels, bool (side, side), count (None: all). `grey` is float32 (side, side), 0 to 255; the same
-    array is returned if its contrast is sufficient or too low. `pixel_px`: width and height, in pixels of the square,
-    of a pixel of the original picture."""
+    blocks of `allowed` pixels, bool (side, side), are used (None: all). `grey` is float32 (side, side), 0 to 255; the
+    same array is returned if its contrast is sufficient or too low. `pixel_px`: width and height of a pixel of the
+    original picture, in pixels of the square."""
     low, high = _find_range(grey, allowed)
     range_levels = high - low
     noise_levels = _NOISE_LEVELS * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_PER_SIDE / len(grey)
@@ -45,7 +45,7 @@ def stretch_contrast(
         return grey
     ratio = min_levels / range_levels
     gain = min(ratio * ratio * ratio, target_levels / range_levels)  # starts at 1, without a jump
-    # A bright on-screen display must not bleed into the ground beside it.
+    # A bright on-screen display must not bleed into the ground next to it.
     picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
     sigma = min(_MAX_SIGMA_PIXELS, sigma_pixels * math.log2(gain))
     across, down = (min(max(1, round(pixels)), len(grey) // 4) for pixels in pixel_px)
@@ -59,15 +59,15 @@ def stretch_contrast(
 
 
 def _find_range(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
-    """Return the ends of the range of grey levels (see `stretch_contrast`): (0, 0) where no block is allowed."""
+    """Return the ends of the range of grey levels (see `stretch_contrast`); (0, 0) if no block is allowed."""
     means = _average_blocks(round_levels(grey))
     if allowed is not None:
         means = means[_average_blocks(allowed.view(np.uint8)) > 0.999]
     if not means.size:
         return 0.0, 0.0
-    clipped = int(_CLIPPED_SHARE * means.size)
+    clipped_count = int(_CLIPPED_FRACTION * means.size)
     ordered = np.sort(means, axis=None)
-    return float(ordered[clipped]), float(ordered[-1 - clipped])
+    return float(ordered[clipped_count]), float(ordered[-1 - clipped_count])
 
 
 def _average_blocks(levels: Array) -> Array:

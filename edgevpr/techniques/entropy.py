@@ -1,7 +1,7 @@
 """Entropy of an image around each pixel, and the blocks of high entropy: the good blocks of CoHOG (thesis 6.2.1).
 
-Both entropies use the histogram of the intensities in a disc around each pixel (81 pixels for radius 5), counting only
-pixels inside the image. They are divided by 8 bits, the maximum for 256 intensities."""
+Both entropies use the histogram of the intensities in a disc around each pixel (81 pixels for radius 5), without pixels
+outside the image. They are divided by 8 bits, the maximum for 256 intensities."""
 
 from functools import lru_cache, reduce
 
@@ -12,11 +12,11 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Singles
 
 DISC_RADIUS_PX = 5
 SHANNON_SIDE_PX = 100  # the authors' public code uses a copy of this size
-# Sizes of the parts that are computed at once, so that the sums stay in cache.
+# Sizes of the parts that are processed at once, so that the sums stay in cache.
 _STRIP_ROWS = 32
 _STRIP_PIXELS = 256
 _STRIP_INTENSITIES = 16
-_MAX_ROUNDING = 1e-5  # more than float32 rounding can change the mean entropy of a block
+_MAX_ROUNDING = 1e-5  # float32 rounding changes the mean entropy of a block by less
 _LOG2 = np.log2(np.arange(257, dtype=np.float32).clip(1))
 _LOG2_OVER_8 = _LOG2 / 8
 _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
@@ -51,17 +51,17 @@ def average_blocks(per_pixel: Array, cell_px: int) -> Array:
     return means
 
 
-def find_good_blocks(grey: Bytes, kind: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
+def find_good_blocks(grey: Bytes, kind: str, cell_px: int, threshold: float, eligible: Bools | bool = True) -> Bools:
     """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `kind` is the
     entropy: "filled_bins" or "shannon". `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
-    (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
+    (H/cell_px - 1, W/cell_px - 1), False where `eligible`, bool of this shape, is False (True: consider all).
 
-    Cheap bounds of the Shannon entropy decide nearly every block. The entropy is computed only at the pixels of the
+    Cheap bounds of the Shannon entropy settle nearly every block. The entropy is computed only at the pixels of the
     other blocks; the result is the same as with the full entropy map."""
     if kind == "filled_bins":
-        return (average_blocks(compute_filled_bins(grey), cell_px) >= threshold) & among
+        return (average_blocks(compute_filled_bins(grey), cell_px) >= threshold) & eligible
     small = _make_shannon_copy(grey)
-    # The entropy of the lower four bits is a lower bound. Among 16 k values the upper bits add at most log2 k.
+    # The entropy of the lower four bits is a lower bound. In a range of 16 k values, the upper bits add at most log2 k.
     entropy = _compute_shannon_map(small & 15)
     upper = entropy + _LOG2_OVER_8[(_compute_range(small) >> 4) + 1]
     down, across = (_make_block_matrix(side, cell_px) for side in grey.shape)
@@ -70,17 +70,17 @@ def find_good_blocks(grey: Bytes, kind: str, cell_px: int, threshold: float, amo
         return np.asarray(down @ values @ across.T)
 
     undecided = (average(entropy) < threshold + _MAX_ROUNDING) & (average(upper) >= threshold - _MAX_ROUNDING)
-    undecided &= among
+    undecided &= eligible
     if undecided.any():
-        needed = (down.T @ undecided @ across > 0) & (entropy < upper)
-        entropy[needed] = _compute_shannon_pixels(small, needed)
+        is_needed = (down.T @ undecided @ across > 0) & (entropy < upper)
+        entropy[is_needed] = _compute_shannon_pixels(small, is_needed)
         if (np.abs(average(entropy)[undecided] - threshold) < _MAX_ROUNDING).any():
-            return (average_blocks(compute_shannon(grey), cell_px) >= threshold) & among
-    return (average(entropy) >= threshold) & among
+            return (average_blocks(compute_shannon(grey), cell_px) >= threshold) & eligible
+    return (average(entropy) >= threshold) & eligible
 
 
 def _make_shannon_copy(grey: Bytes) -> Array:
-    # INTER_LINEAR_EXACT: plain INTER_LINEAR differs by a grey level between processors, and a map must work on all.
+    # INTER_LINEAR_EXACT, because INTER_LINEAR differs by a grey level between processors, and a map must work on all.
     return cv2.resize(grey, (SHANNON_SIDE_PX, SHANNON_SIDE_PX), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
@@ -89,10 +89,10 @@ def _make_block_matrix(side_px: int, cell_px: int) -> Singles:
     """Return the matrix float32 (cells - 1, 100) that enlarges a row of the 100x100 copy to `side_px` pixels, and
     averages it over each pair of neighbouring cells of `cell_px` pixels."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
-    back = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
+    enlargement = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
     cells = side_px // cell_px
     pairs = np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)
-    matrix: Singles = (pairs / 2) @ back.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
+    matrix: Singles = (pairs / 2) @ enlargement.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
     return matrix
 
 
@@ -126,7 +126,7 @@ def _compute_shannon_map(small: Array) -> Singles:
 
 
 def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_compute_shannon_map` at the P True pixels of bool (H, W) only, each from its own histogram: float32
+    """Compute `_compute_shannon_map` only at the P True pixels of bool (H, W), each from its own histogram: float32
     (P,)."""
     r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside the image
@@ -146,8 +146,8 @@ def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:
 
 
 def _combine_over_disc(planes: Array, combine: np.ufunc) -> Array:
-    """Combine the values in the disc around each pixel of each plane by an associative ufunc (add, bitwise_or): planes
-    padded by the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
+    """Combine the values in the disc around each pixel of each plane with an associative ufunc (add, bitwise_or):
+    planes padded by the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
     r, pitch = DISC_RADIUS_PX, planes.shape[-1]
     half_width = [int((r * r - dy * dy) ** 0.5) for dy in range(r + 1)]
     flat = planes.ravel()

@@ -1,8 +1,8 @@
 """Histograms of oriented gradients over cells and blocks, for `hog`, `cohog` and the training of CALC, and the
 low-frequency ("slow") patterns of blocks.
 
-A map made on one processor is used on another, so results must be rounded identically on all of them: products, sums
-and roots are computed one by one. OpenCV's fused operations and matrix products are rounded differently.
+A map made on one processor may be used on another, so results must be rounded identically on all of them: products,
+sums and roots are computed one by one. The rounding of OpenCV's fused operations and matrix products differs.
 """
 
 from functools import lru_cache
@@ -14,7 +14,7 @@ from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 
 _STRIP_ROWS = 64  # rows computed at once, so that the planes of a strip stay in cache
 _SIGN_BIT = np.uint32(1 << 31)
-# Fitted for the smallest maximum error over -45..45 degrees (2e-6 of the magnitude): see `_sum_octants`.
+# Fitted to minimise the maximum error over -45..45 degrees (2e-6 of the magnitude); see `_sum_octants`.
 _P = 2.904936713
 _Q = 2.067222680
 _R = 0.162280117
@@ -32,7 +32,7 @@ _ORIENTATIONS = np.array(
     ],
     np.float32,
 )
-# Weights of the cells top left, top right, bottom left, bottom right, and the frequencies over the orientations to keep
+# Weights of the cells top left, top right, bottom left, bottom right, and the frequencies over orientations to keep
 # for them (None: all).
 _PATTERN_WAVES = (
     ((1, 1, 1, 1), None),
@@ -44,7 +44,7 @@ _PATTERN_WAVES = (
 
 def make_grey_square(image: Image, side_px: int) -> Array:
     """Convert a uint8 image, (H, W) grey or (H, W, 3) BGR, to float32 grey (side_px, side_px), 0 to 255. The values are
-    not rounded to grey levels: processors would round those between two levels differently."""
+    not rounded to grey levels, because processors round values between two levels differently."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return cv2.resize(grey.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
 
@@ -77,10 +77,10 @@ def pad_to_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
 
 def compute_histograms(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
     """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2):
-    the square root of the image over its maximum, central differences, and the gradient magnitude, shared between the
+    the square root of the image over its maximum, central differences, and the gradient magnitude, split between the
     two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or uint8 (H, W), 0 to 255,
-    with sides that are multiples of `cell_px`. Pixels where the bool (H, W) `allowed` is False do not count (None: all
-    do). Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0."""
+    with sides that are multiples of `cell_px`. Pixels where `allowed`, bool (H, W), is False are ignored (None: none).
+    Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0."""
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
     vote = _sum_octants if signed and bins == 8 else _sum_angles
     mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border
@@ -105,27 +105,27 @@ def _sum_angles(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> 
     angle = np.arctan2(dy, dx)
     angle *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; integers are bin centres
     low = np.floor(angle)
-    high_share = angle - low
+    high_weight = angle - low
     low = low.astype(np.intp) % bins
     high = (low + 1) % bins
 
     rows, cols = dx.shape[0] // cell_px, dx.shape[1] // cell_px
     cell = np.add.outer(np.arange(dx.shape[0]) // cell_px * cols, np.arange(dx.shape[1]) // cell_px) * bins
     size = rows * cols * bins
-    votes = np.bincount((cell + low).ravel(), (magnitude * (1 - high_share)).ravel(), size)
-    votes += np.bincount((cell + high).ravel(), (magnitude * high_share).ravel(), size)
+    votes = np.bincount((cell + low).ravel(), (magnitude * (1 - high_weight)).ravel(), size)
+    votes += np.bincount((cell + high).ravel(), (magnitude * high_weight).ravel(), size)
     return votes.reshape(rows, cols, bins)
 
 
 def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
-    """Compute the same sums as `_sum_angles` for 8 orientations over 360 degrees, without angles, branches or
+    """Compute the sums of `_sum_angles` for 8 orientations over 360 degrees, without angles, branches or
     scattered sums.
 
     A gradient of magnitude m is in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
     |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g < 0. With v = sqrt(2) m
     sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is summed over the cells
-    once unchanged, and once with its signs flipped by those of dx, dy or both. The orientations are sums and
-    differences of these."""
+    once unchanged, and once with the signs of dx, dy or both applied to it. The orientations are sums and differences
+    of these."""
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)
@@ -168,8 +168,7 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
 
 
 def _compute_magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
-    """Return the magnitude of each gradient, written to `out` if given, and an array of the same shape as scratch
-    space."""
+    """Return the magnitude of each gradient (in `out`, unless it is None), and a scratch array of the same shape."""
     squares, scratch = np.multiply(dx, dx, out=out), dy * dy
     squares += scratch
     return cv2.sqrt(squares, squares), scratch
@@ -195,15 +194,15 @@ def normalise_rows(rows: Singles) -> Singles:
 def make_slow_patterns(bins: int) -> Singles:
     """Return the low-frequency ("slow") patterns of a block of 2x2 cells of `bins` orientations: float32 (4 * bins,
     patterns), one per column, orthonormal. A pattern is a wave over the cells (mean, left against right, top against
-    bottom, diagonal against diagonal) times a wave over the orientations. Of the 32 patterns of 8 orientations these
-    are the 20 with the most power on the tuning sets, which give the same recall."""
+    bottom, diagonal against diagonal) times a wave over the orientations. Of the 32 patterns of 8 orientations, these
+    are the 20 with the most power on the tuning sets; they yield the same recall."""
     frequency = _list_frequencies(bins)
     return np.vstack(
         [
             np.kron(np.array(cells) / 2, wave)
-            for cells, kept in _PATTERN_WAVES
+            for cells, frequencies in _PATTERN_WAVES
             for periods, wave in zip(frequency, make_waves(bins), strict=True)
-            if kept is None or periods in kept
+            if frequencies is None or periods in frequencies
         ]
     ).T.astype(np.float32, order="C")
 
@@ -211,10 +210,10 @@ def make_slow_patterns(bins: int) -> Singles:
 @lru_cache
 def make_waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
-    1. The constant comes first, then cosine and sine of each frequency (the highest of an even number: cosine only)."""
+    1. The constant comes first, then cosine and sine of each frequency (even `bins`: only cosine of the highest)."""
     angle = 2 * np.pi * np.arange(bins) / bins
-    frequency, number = _list_frequencies(bins), np.arange(bins)
-    series = np.cos(frequency[:, None] * angle - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
+    frequency, row = _list_frequencies(bins), np.arange(bins)
+    series = np.cos(frequency[:, None] * angle - np.pi / 2 * (row[:, None] % 2 == 0) * (row[:, None] > 0))
     unit: Singles = (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
     return unit
 

@@ -33,8 +33,8 @@ Head = Callable[[Singles], Singles]  # converts an output of a network to a vect
 
 
 class NetworkVector(VectorTechnique):
-    """A technique whose vector `head` computes from one output of a network (None: the output is the vector). The head
-    raises ModelError if the feature map is too small. `spec`: further arguments of `VectorTechnique`."""
+    """A technique whose vector is computed by `head` from one output of a network (None: the output is the vector). The
+    head raises ModelError if the feature map is too small. `spec`: further arguments of `VectorTechnique`."""
 
     def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
         self._backbone, self._head = backbone, head or np.asarray
@@ -76,13 +76,13 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
 
     Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, as in thesis 4.2.1: `conv5`
     of a network trained from scratch on the places of SPED (its card is `model`), with spatial pyramid pooling.
-    Dividing by the sum finds more places in the tuning sets."""
+    Dividing by the sum recognises more places in the tuning sets."""
     return _make_pyramid("amosnet", model, form, threads, levels)
 
 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
     """Make `hybridnet`: `amosnet` with other weights, fine-tuned from CaffeNet (Chen et al., ICRA 2017; thesis 4.2.1).
-    Give the card of these weights as `model`."""
+    Pass the card of these weights as `model`."""
     return _make_pyramid("hybridnet", model, form, threads, levels)
 
 
@@ -127,25 +127,25 @@ def region_vlad(
 
 
 def make_from_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make the technique of a card: its vector is the network's descriptor. A map records no parameters, since the hash
-    of the network covers them. No match is accepted until the configuration sets a minimum margin."""
+    """Make the technique of a card: its vector is the network's descriptor. A map records no parameters, because the
+    hash of the network covers them. No match is accepted until the configuration sets a minimum margin."""
     backbone = Backbone(card, "descriptor", threads)
     # None: earlier versions hashed more values here, and their maps must stay valid.
     sha256 = compute_digest([backbone.sha256, None, card.similarity, None])
     technique = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
     noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
-    technique.encode(noise)  # raises ModelError for numbers that half precision cannot hold
+    technique.encode(noise)  # raises ModelError for values outside the half-precision range
     return technique
 
 
 def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -> NetworkVector:
     if not 1 <= levels <= 64:
-        raise UsageError(f"{name}: levels is {levels}; it must be 1 to 64.")
+        raise UsageError(f"{name}: levels is {levels}, but must be 1 to 64.")
 
     def head(features: Singles) -> Singles:
         pooled = pool_pyramid(features, levels)
-        shares: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
-        return shares
+        normalised: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
+        return normalised
 
     backbone = open_backbone(model, "features", threads)
     return NetworkVector(
@@ -196,7 +196,7 @@ def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Sin
 
 def make_gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
     """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. They must stay the
-    same as long as a map is used. NumPy guarantees that only for the raw numbers of PCG64 (NEP 19), so these are used:
+    same as long as a map is used. NumPy guarantees this only for the raw values of PCG64 (NEP 19), so these are used:
     first two for each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
     pairs = -(-size // 2)
     raw = np.random.PCG64(seed).random_raw(2 * pairs + size)

@@ -11,10 +11,10 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Doubles
 
 _FIT_ROUNDS = 10
-_MAX_RESIDUAL_CELLS = 1.5  # largest distance of an agreeing region from the fit
+_MAX_RESIDUAL_CELLS = 1.5  # maximum distance of an agreeing region from the fit
 _MIN_PAIRS = 12
-_SLOPE_PRIOR_SD = 0.17  # of the change of scale per cell: far more than in any accepted picture
-_CORRELATED_REGIONS = 5.0  # neighbouring regions share pixels and relief, so this many count as one
+_SLOPE_PRIOR_SD = 0.17  # of the change of scale per cell; far larger than in any accepted picture
+_CORRELATED_REGIONS = 5.0  # neighbouring regions share pixels and relief, so this many are worth one
 _MIN_SCALE = 0.05  # smaller scales are at or beyond the horizon of the homography
 
 
@@ -45,18 +45,18 @@ def fit_perspective(
         equations *= weight[:, None]
         normal = equations.T @ equations + np.diag([0.0] * 6 + [_SLOPE_PRIOR_SD**-2] * 2)
         homography = np.linalg.solve(normal, equations.T @ (weight * np.concatenate([target_x, target_y])))
-    agrees, misses = _compute_residuals(homography, query, place)
+    agrees, errors = _compute_residuals(homography, query, place)
     if np.count_nonzero(agrees) < _MIN_PAIRS:
         return None
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
-    variance = float((np.abs(misses[agrees]) ** 2).mean()) / 2 + 1 / 12
+    variance = float((np.abs(errors[agrees]) ** 2).mean()) / 2 + 1 / 12
     covariance = _CORRELATED_REGIONS * variance * np.linalg.inv(normal)[6:, 6:]
     homography = np.append(homography, 1.0).reshape(3, 3)
     return homography, float(np.sqrt(np.trace(covariance) / 2)), int(np.count_nonzero(agrees))
 
 
 def _compute_residuals(homography: Doubles, query: Array, place: Array) -> tuple[Bools, Array]:
-    """Return which regions agree with a homography, bool (n,), and the residual of each, complex (n,)."""
+    """Return whether each region agrees with a homography, bool (n,), and its residual, complex (n,)."""
     x, y = query.real, query.imag
     scale = 1 + homography[6] * x + homography[7] * y
     expected = (
@@ -65,6 +65,6 @@ def _compute_residuals(homography: Doubles, query: Array, place: Array) -> tuple
         + homography[2]
         + 1j * (homography[3] * x + homography[4] * y + homography[5])
     ) / np.maximum(scale, _MIN_SCALE)
-    misses = place - expected
-    agrees: Bools = (np.maximum(np.abs(misses.real), np.abs(misses.imag)) <= _MAX_RESIDUAL_CELLS) & (scale > _MIN_SCALE)
-    return agrees, misses
+    errors = place - expected
+    agrees: Bools = (np.maximum(np.abs(errors.real), np.abs(errors.imag)) <= _MAX_RESIDUAL_CELLS) & (scale > _MIN_SCALE)
+    return agrees, errors

@@ -1,9 +1,9 @@
-"""The coarse stage of `cohog` for a forward camera: a place is 144 bytes, and is found even if the camera has moved.
+"""The coarse stage of `cohog` for a forward camera: places of 144 bytes, recognised even if the camera has moved.
 
 The block-normalised HOG is averaged over 12x12 cells (its *grid*), minus the map's mean grid. The L orientations of
-each cell are written as a Fourier series, since neighbouring ones are correlated, and only the signs of its
-coefficients are kept. A query is compared under every shift of its grid, a *hypothesis*: one product of two matrices
-compares hypotheses and places."""
+each cell are written as a Fourier series, because neighbouring ones are correlated, and only the signs of its
+coefficients are kept. A query is compared under every shift of its grid, a *hypothesis*: one matrix product compares
+hypotheses and places."""
 
 from functools import lru_cache
 
@@ -14,11 +14,11 @@ from edgevpr.techniques.gradients import make_waves
 
 SIDE = 12  # cells along one side
 _SAMPLES_PER_SIDE = 3  # along one side of a cell: about one per block, for 31 blocks
-_MIN_OVERLAP = 0.5  # a smaller overlap costs more shifts, and found no more places on any data set
-_FULL_SCAN_PLACES = 500  # compared under all shifts: a tenth of the time of a scan of 10,000
+_MIN_OVERLAP = 0.5  # a smaller one needs more shifts, but recognised no more places on any data set
+_FULL_SCAN_PLACES = 500  # compared under all shifts; takes a tenth of the time of a scan of 10,000
 _BITS_PER_PRODUCT = 1 << 19  # of places: 2 MB as float32
 
-# The eight bits of each byte, first bit first, as +1 or -1: one look-up instead of `unpackbits` and arithmetic.
+# The eight bits of each byte, first bit first, as +1 or -1: a look-up replaces `unpackbits` and arithmetic.
 _BYTE_SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
@@ -28,18 +28,18 @@ _HAS_OVERLAP = (SIDE - abs(_DX)) * (SIDE - abs(_DY)) >= _MIN_OVERLAP * SIDE**2
 SHIFTS = np.stack([_DX[_HAS_OVERLAP], _DY[_HAS_OVERLAP]], axis=1).astype(np.int8)
 
 
-def make_grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bools]:
+def make_grid(blocks: Singles, seen: Bools, used: Bools) -> tuple[Singles, Bools]:
     """Make the grid of a picture from its blocks float32 (n, n, 4 L), each of L orientations for its 2x2 cells. Only
-    the central square of the blocks `seen`, bool (n, n), at least 12 wide, is used: it has no border of the picture.
-    The blocks `counted`, bool (n, n), are averaged in each of 12x12 larger cells, normalised to length 1, so that
-    contrast and haze do not count. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half of
-    the cell is counted."""
+    the central square of the blocks `seen`, bool (n, n), at least 12 wide, is used: it excludes the picture's border.
+    The blocks `used`, bool (n, n), are averaged in each of 12x12 larger cells, which are normalised to length 1 to be
+    independent of contrast and haze. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half
+    of the cell is used."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
-    middle, block_numbers = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _list_blocks(n)
-    per_block, counts = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), counted[middle, middle].ravel()
-    cells = (per_block * counts[:, None])[block_numbers].mean(axis=1)
+    middle, block_indices = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _list_blocks(n)
+    per_block, weights = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), used[middle, middle].ravel()
+    cells = (per_block * weights[:, None])[block_indices].mean(axis=1)
     cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
-    return cells.reshape(SIDE, SIDE, -1), (counts[block_numbers].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
+    return cells.reshape(SIDE, SIDE, -1), (weights[block_indices].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
 
 
 def compute_deviations(grids: Floats, mean: Floats) -> Array:
@@ -51,7 +51,7 @@ def compute_deviations(grids: Floats, mean: Floats) -> Array:
 
 def pack_grids(grids: Floats, mean: Floats) -> Bytes:
     """Make the rows of the index from `grids` (N, 12, 12, L) and the map's mean (12, 12, L): uint8 (N, 18 L), the sign
-    of each number of `compute_deviations` as one bit."""
+    of each value of `compute_deviations` as one bit."""
     return np.packbits((compute_deviations(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
 
 
@@ -67,9 +67,9 @@ def make_hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
 
 def scan_codes(queries: Singles, codes: Bytes) -> Singles:
     """Compare every hypothesis, `queries` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
-    score of each place, float32 (N,): the share of equal bits minus that of different ones (1: the same picture, 0:
+    score of each place, float32 (N,): the fraction of equal bits minus that of different ones (1: the same picture, 0:
     chance)."""
-    by_bit = queries.T
+    transposed = queries.T
     best = np.empty(len(codes), np.float32)
     block = max(1, _BITS_PER_PRODUCT // queries.shape[1])
     bits = np.empty((block, codes.shape[1], 8), np.float32)
@@ -78,14 +78,14 @@ def scan_codes(queries: Singles, codes: Bytes) -> Singles:
         part = codes[start : start + block]
         count = len(part)
         np.take(_BYTE_SIGNS, part, axis=0, out=bits[:count], mode="clip")
-        np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
+        np.matmul(bits[:count].reshape(count, -1), transposed, out=scores[:count])
         np.max(scores[:count], axis=1, out=best[start : start + count])
     best /= queries.shape[1]
     return best
 
 
 def scan_in_two_steps(queries: Singles, codes: Bytes) -> Singles:
-    """Compare as `scan_codes` does, but faster: all places under a quarter of the shifts, each averaged with the shifts
+    """Compare like `scan_codes`, but faster: all places under a quarter of the shifts, each averaged with the shifts
     around it, then only the best 500 places under all shifts."""
     if len(codes) <= _FULL_SCAN_PLACES:
         return scan_codes(queries, codes)
@@ -97,24 +97,24 @@ def scan_in_two_steps(queries: Singles, codes: Bytes) -> Singles:
 
 @lru_cache
 def _make_blur_weights() -> Singles:
-    """Return the weights, float32 (E, S), by which `scan_in_two_steps` averages: row e has the weights of all S shifts
-    in the mean around the e-th of the E shifts with even dx and dy."""
-    kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
-    weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
+    """Return the averaging weights of `scan_in_two_steps`, float32 (E, S): row e has the weights of all S shifts in the
+    mean around the e-th of the E shifts with even dx and dy."""
+    even = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
+    weight = np.maximum(1 - abs(even[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     return weights
 
 
 @lru_cache(maxsize=8)
 def _list_blocks(n: int) -> Ints:
-    """Return the numbers of the blocks that are averaged in each of the 12x12 cells of a grid, 9 per cell (some may be
-    equal), counted row by row in the picture's n x n blocks: int (144, 9)."""
+    """Return the row-major indices, in the picture's n x n blocks, of the blocks that are averaged in each of the 12x12
+    cells of a grid, 9 per cell (some may be equal): int (144, 9)."""
     samples = np.floor((np.arange(SIDE * _SAMPLES_PER_SIDE) + 0.5) / (SIDE * _SAMPLES_PER_SIDE) * n).astype(np.intp)
-    numbers = np.add.outer(samples * n, samples).reshape(SIDE, _SAMPLES_PER_SIDE, SIDE, _SAMPLES_PER_SIDE)
-    return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES_PER_SIDE**2)
+    indices = np.add.outer(samples * n, samples).reshape(SIDE, _SAMPLES_PER_SIDE, SIDE, _SAMPLES_PER_SIDE)
+    return indices.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES_PER_SIDE**2)
 
 
 def _slice_target(step: int) -> slice:
-    """Return the slice of one axis of the grid to which cells are copied when the grid is moved by `step` cells along
-    it; they are copied from the slice of `-step`."""
+    """Return the slice of one axis of the grid to which cells are copied if the grid is shifted by `step` cells along
+    it; they are copied from the slice for `-step`."""
     return slice(max(0, step), SIDE + min(0, step))

@@ -1,5 +1,5 @@
 """Techniques that match regions of a feature map: `rmac` uses squares, `cross_region_bow` uses active areas. Both scan
-the map with one vector per image, then compare the best places region by region.
+the map using one vector per image, then compare the best places region by region.
 
 Cross-Region-BoW and Region-VLAD (see `network`) find regions in the same way: the 8-connected components of positive
 activations in each channel. The regions with the highest mean activation (*energy*) over all channels are kept. Each is
@@ -22,14 +22,14 @@ from edgevpr.techniques.words import compute_bag_of_words, load_words, normalise
 _TINY = 1e-12
 Describe = Callable[[Singles], tuple[Singles, Singles]]
 Square = tuple[int, int, int]  # top, left, side, in cells of a feature map
-_RMAC_OVERLAP_SHARE = 0.4  # target for neighbouring squares (Tolias et al. 2016, section 3.2)
+_RMAC_OVERLAP = 0.4  # target for neighbouring squares (Tolias et al. 2016, section 3.2)
 _RMAC_SCALES = 3
 
 
 class RegionTechnique(VectorTechnique):
     """Base class of the techniques that scan with one vector and compare the best places by their regions. `describe`
     converts a feature map, float32 (C, H, W), to the vector float32 (D,) and the regions float32 (N, C), each of length
-    1 (rows of zeros if fewer than N are found). `quality` converts bool (N,), True for each region found, to the
+    1 (padded with rows of zeros if there are fewer). `quality` converts bool (N,), True for each real region, to the
     quality, 0 to 1."""
 
     candidates = 40
@@ -42,7 +42,7 @@ class RegionTechnique(VectorTechnique):
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), fine int8 (N, C), `regions` float32 (N, C) of length 1, and
-        `good` bool (N,), True for each region found. Pixels where `mask` is False get the mean of the others."""
+        `good` bool (N,), True for each real region. Pixels where `mask` is False are set to the mean of the others."""
         vector, regions = self._describe(self._backbone.run(image, mask))
         good: Array = np.any(regions, axis=1)
         return Descriptor(
@@ -54,8 +54,8 @@ class RegionTechnique(VectorTechnique):
         )
 
     def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:
-        """Score a place by its stored regions `fine`, int8 (N, C), from 0 to 1 (see `score_mutual_pairs`). A descriptor
-        that was read from a map has no float regions, and scores 0."""
+        """Score a place by its stored regions `fine`, int8 (N, C), from 0 to 1 (see `score_mutual_pairs`). A
+        descriptor that was read from a map has no float regions, and scores 0."""
         return FineMatch(0.0 if query.regions is None else score_mutual_pairs(query.regions, from_bytes(fine)))
 
 
@@ -64,8 +64,8 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
     parameters see `network`.
 
     Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, as
-    in thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, matched mutually without geometric verification. The
-    coarse part is the sum of the squares' vectors; the quality is the share of squares with any activation."""
+    in thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, matched mutually without geometric verification.
+    The coarse part is the sum of the squares' vectors; the quality is the fraction of squares with any activation."""
     backbone = open_backbone(model, "features", threads)
     squares = make_square_regions(*backbone.shape[1:])
 
@@ -106,7 +106,7 @@ def open_region_backbone(technique: str, model: str, threads: int, regions: int)
     """Open the network of the card `model` for a `technique` that finds `regions` regions in its feature map. Raises
     UsageError unless `regions` is 1 to 10,000."""
     if not 1 <= regions <= 10_000:
-        raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10,000.")
+        raise UsageError(f"{technique}: regions is {regions}, but must be 1 to 10,000.")
     return open_backbone(model, "features", threads)
 
 
@@ -122,7 +122,7 @@ def make_square_regions(height: int, width: int) -> list[Square]:
     # A square feature map has one region at the first scale; others have 2 to 7, as in the authors' code.
     m = 1
     if long > short:
-        m = min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP_SHARE))
+        m = min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP))
     regions = []
     for scale in range(1, _RMAC_SCALES + 1):
         side = 2 * short // (scale + 1)
@@ -151,7 +151,7 @@ def find_regions(features: Singles, count: int) -> Ints:
     boxes int (N, 4) in its cells: (top, left, bottom, right), bottom and right exclusive, highest energy first. Ties
     are sorted by channel, from the top, then from the left."""
     channels, height, width = features.shape
-    # Stack the channels into one tall image with empty rows between them: one search instead of one per channel.
+    # Stack the channels into one tall image with empty rows between them, to search once instead of once per channel.
     tall = np.zeros((channels, height + 1, width), np.float32)
     np.maximum(features, 0, out=tall[:, :height])
     tall = tall.reshape(-1, width)
@@ -179,17 +179,17 @@ def describe_regions(features: Singles, boxes: Ints) -> Singles:
 
 
 def score_mutual_pairs(query: Singles, place: Singles) -> float:
-    """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
-    mutual best matches, divided by the larger number of regions (the papers do not divide). Negative cosines count as
-    0, and all-zero rows are not regions."""
-    query_regions, place_regions = (int(regions.any(axis=1).sum()) for regions in (query, place))
-    if not query_regions or not place_regions:
+    """Score two sets of unit-length region descriptors, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the
+    cosines of mutual best matches, divided by the larger number of regions (the papers do not divide). Negative cosines
+    count as 0, and all-zero rows are ignored."""
+    query_count, place_count = (int(regions.any(axis=1).sum()) for regions in (query, place))
+    if not query_count or not place_count:
         return 0.0
     cosines = query @ place.T
     best = cosines.argmax(axis=1)
-    mutual = cosines.argmax(axis=0)[best] == np.arange(len(query))
-    total = np.maximum(cosines[np.arange(len(query)), best], 0)[mutual].sum()
-    return float(min(total / max(query_regions, place_regions), 1.0))
+    is_mutual = cosines.argmax(axis=0)[best] == np.arange(len(query))
+    total = np.maximum(cosines[np.arange(len(query)), best], 0)[is_mutual].sum()
+    return float(min(total / max(query_count, place_count), 1.0))
 
 
 def to_bytes(vectors: Singles) -> Array:

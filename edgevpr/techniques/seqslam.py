@@ -14,15 +14,15 @@ from edgevpr.core.arrays import Array, Doubles, Image, Mask, Singles
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import UsageError
 
-_SEQUENCE_QUERIES = 10  # queries matched together, unless the configuration sets another number
+_SEQUENCE_QUERIES = 10  # length of a sequence, unless the configuration sets another one
 _WINDOW_PLACES = 10  # R_window of the paper: five places before and five after
-_MEAN_LEVEL = 128  # of a pixel as bright as the mean of its patch
+_MEAN_LEVEL = 128  # level of a pixel as bright as the mean of its patch
 _LEVELS_PER_SD = 28  # eight bits reach 4.5 standard deviations either way
-_MIN_PATCH_SD_LEVELS = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
+_MIN_PATCH_SD_LEVELS = 1.0  # in grey levels; a patch with less variation does not describe the place
 
 
 class SeqSlam:
-    """SeqSLAM: a place is a small image of `width` x `height` pixels, a byte each (2 KB by default), normalised in
+    """SeqSLAM: a place is a small image of `width` x `height` one-byte pixels (2 KB by default), normalised in
     patches of `patch` x `patch` pixels."""
 
     candidates = 1  # it has no fine part to compare
@@ -47,7 +47,7 @@ class SeqSlam:
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse uint8 (height * width,): 128 + 28 times the deviation of a pixel from its
         patch's mean, in standard deviations of the patch. Pixels where `mask` is False count as their patch's mean. The
-        quality is the share of patches that vary."""
+        quality is the fraction of patches that vary."""
         size = (self._width, self._height)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         seen = np.ones(image.shape[:2], np.uint8) if mask is None else mask.astype(np.uint8)
@@ -66,22 +66,22 @@ class SeqSlam:
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
     def score_places(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
-        """Score each place by how much better the query fits it than the places around it in the map. `rows` are uint8
-        (N, length). Returns scores float32 (N,) in 0..1, and None, since there are no hypotheses. 0.5 means that the
-        place fits as well as those around it. The score is linear in the enhanced difference (see `enhance_contrast`),
-        so the trajectory with the best mean score is that of the least summed difference."""
+        """Score each place by how much better the query matches it than the places around it in the map. `rows` are
+        uint8 (N, length). Returns scores float32 (N,) in 0..1, and None (no hypotheses). 0.5 means that the place
+        matches as well as those around it. The score is linear in the enhanced difference (see `enhance_contrast`), so
+        the trajectory with the best mean score is that of the least summed difference."""
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
-        # None of n values is more than (n - 1) / sqrt(n) standard deviations from their mean.
+        # No value of n is more than (n - 1) / sqrt(n) standard deviations from their mean.
         max_deviation = _WINDOW_PLACES / math.sqrt(_WINDOW_PLACES + 1)
         return (0.5 - enhance_contrast(differences) / (2 * max_deviation)).astype(np.float32), None
 
 
 def normalise_patches(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
-    """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels that
-    do not count) are float32 (patches, pixels). Returns the normalised pixels, float32 (patches, pixels), 0 where not
-    allowed or where the patch is flat; and the standard deviations, float32 (patches,)."""
+    """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels to
+    ignore) are float32 (patches, pixels). Returns the normalised pixels, float32 (patches, pixels), 0 where not allowed
+    or where the patch is flat; and the standard deviations, float32 (patches,)."""
     count = np.maximum(allowed.sum(axis=1, keepdims=True), 1)
     centred = (pixels - (pixels * allowed).sum(axis=1, keepdims=True) / count) * allowed
     spread = np.sqrt((centred**2).sum(axis=1, keepdims=True) / count)

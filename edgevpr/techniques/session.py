@@ -1,5 +1,5 @@
-"""Runs a network on an image and returns its outputs. Only this module uses onnxruntime in flight; the first network
-imports it. A model file is not trusted: it is run once before the flight, and every result is checked."""
+"""Runs a network on an image and returns its outputs. Only this module uses onnxruntime in flight, and imports it for
+the first network. A model file is not trusted: it is run once before the flight, and every result is checked."""
 
 import os
 from functools import cache
@@ -28,7 +28,7 @@ class Backbone:
 
     Raises ModelError, with a message of one sentence, if onnxruntime or the card's file is missing, if the file does
     not match the card or is not ONNX, if an input or output has the wrong shape or an axis without a size, or if the
-    result of the check is not finite or all zeros. Raises UsageError unless `threads` is 1 to 256.
+    check yields non-finite values or only zeros. Raises UsageError unless `threads` is 1 to 256.
     """
 
     def __init__(self, card: Card, output: str, threads: int = 1) -> None:
@@ -39,7 +39,7 @@ class Backbone:
             )
         self.card, self.output, self.sha256 = card, output, card.fingerprint
         self.session = open_session(card, threads)
-        # Use noise: many correct networks output only zeros for a uniform image.
+        # Use noise, because many correct networks output only zeros for a uniform image.
         noise = np.random.default_rng(_NOISE_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
         self.shape = self.run(noise).shape
 
@@ -49,11 +49,11 @@ class Backbone:
         card, name = self.card, getattr(self.card.outputs, self.output)
         prepared = prepare_input(fill_masked(image, mask), card.input)
         (result,) = run_outputs(card, self.session, [name], prepared)
-        rank, form = _OUTPUT_SHAPES[self.output]
+        rank, shape_text = _OUTPUT_SHAPES[self.output]
         if result.ndim != rank or len(result) != 1 or not result.size:
             raise ModelError(
                 f"{card.file_path}: the shape of its output `{name}` is {result.shape}, but `{self.output}` must be "
-                f"{form}: correct `outputs` in the card."
+                f"{shape_text}: correct `outputs` in the card."
             )
         values: Singles = result[0].astype(np.float32, copy=False)
         if not values.any():
@@ -93,16 +93,16 @@ def _load_session(path: Path, sha256: str, threads: int) -> Any:
     file_sha256 = hash_model_file(path)
     if file_sha256 != sha256:
         raise ModelError(
-            f"{path} does not match its card: its SHA-256 is {file_sha256}, and the card expects {sha256}; get the "
+            f"{path} does not match its card: its SHA-256 is {file_sha256}, but the card expects {sha256}: get the "
             "right file, or correct the card."
         )
     runtime = import_onnxruntime()
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # fatal messages only: edgevpr reports errors itself
+    options.log_severity_level = 4  # only fatal messages, because edgevpr reports errors itself
     # Threads that spin while they wait for work waste power.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Refuse weights in a second file, since the hash does not cover them. For a model passed as bytes, onnxruntime
+    # Reject weights in a second file, because the hash does not cover them. For a model passed as bytes, onnxruntime
     # would look for that file in the working directory, so set a folder that does not exist.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
     try:
@@ -140,7 +140,7 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
     for name, result in zip(names, results, strict=True):
         if result.dtype.kind != "f":
             raise ModelError(f"{card.file_path}: its output `{name}` is {result.dtype}, but it must be float.")
-        # Written with `not` so that NaN is refused too.
+        # Written with `not` so that NaN is rejected too.
         if result.size and not max(result.max(), -result.min()) <= _MAX_VALUE:
             raise ModelError(
                 f"{card.file_path} outputs values that are not finite, or beyond {_MAX_VALUE:g}, for `{name}`: correct "
@@ -168,8 +168,8 @@ def prepare_input(image: Array, rule: InputRule) -> Singles:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     elif rule.colour == "rgb":
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    width_share, height_share = compute_fill_shares(image, rule)
-    width, height = round(width_share * rule.width), round(height_share * rule.height)
+    width_fraction, height_fraction = compute_fill_fractions(image, rule)
+    width, height = round(width_fraction * rule.width), round(height_fraction * rule.height)
     image = cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[rule.resize])
     if rule.pad is not None:
         border = (0, rule.height - height, 0, rule.width - width)
@@ -181,8 +181,8 @@ def prepare_input(image: Array, rule: InputRule) -> Singles:
     return np.ascontiguousarray(values.transpose(2, 0, 1)[None])
 
 
-def compute_fill_shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the shares, 0..1, of the width and of the height of the network's input that `prepare_input` fills with
+def compute_fill_fractions(image: Array, rule: InputRule) -> tuple[float, float]:
+    """Return the fractions, 0..1, of the width and the height of the network's input that `prepare_input` fills with
     the image; the rest is padding."""
     if rule.pad is None:
         return 1.0, 1.0

@@ -21,9 +21,9 @@ _SHIPPED_MODEL = "calc"
 _TINY = 1e-6
 _BLOCK_BYTES = 4 << 20  # of places converted to float32 together
 _MIN_BLOCK_PLACES = 16
-_SUFFIX_BYTES = 8  # at the end of an `8bit` row: its step and its length, both float32
-_WORD_BITS = 64  # a `1bit` row is padded to words of this size, whose bits are counted at once
-_CODE_BLOCK_BYTES = 1 << 20  # of binary vectors compared together: about the size of an L2 cache
+_SUFFIX_BYTES = 8  # at the end of an `8bit` row: quantisation step and length, both float32
+_WORD_BITS = 64  # a `1bit` row is padded to words of this size, whose bits are counted together
+_CODE_BLOCK_BYTES = 1 << 20  # of binary vectors compared together; about the size of an L2 cache
 
 
 class VectorTechnique:
@@ -32,7 +32,7 @@ class VectorTechnique:
 
     All scores are 0 to 1. With `similarity` "cosine", the score in the form `float` is the cosine (0 if negative), and
     in `8bit` (1 + cosine) / 2 after subtraction of the map's mean. With "l1" it is 1 / (1 + distance). In `1bit` it is
-    the share of equal bits. `margins` are the minimum margins of an accepted match in the three forms. They hold for
+    the fraction of equal bits. `margins` are the minimum margins of an accepted match in the three forms. They hold for
     the shipped weights: with another `model`, no match is accepted until the configuration sets a minimum margin."""
 
     candidates = 1  # there is no fine part to compare
@@ -51,10 +51,10 @@ class VectorTechnique:
         model_sha256: str | None = None,
     ) -> None:
         if form not in FORMS:
-            raise UsageError(f"{name} has no form `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
+            raise UsageError(f"{name} cannot store vectors as `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
         parameters = parameters or {}
-        is_measured = parameters.get("model", _SHIPPED_MODEL) == _SHIPPED_MODEL
-        self.min_margin = margins[FORMS.index(form)] if is_measured else UNREACHABLE_MARGIN
+        has_shipped_model = parameters.get("model", _SHIPPED_MODEL) == _SHIPPED_MODEL
+        self.min_margin = margins[FORMS.index(form)] if has_shipped_model else UNREACHABLE_MARGIN
         self._similarity, self._length = similarity, length
         self._block_places = max(_BLOCK_BYTES // (4 * length), _MIN_BLOCK_PLACES)
         packed = {
@@ -74,12 +74,12 @@ class VectorTechnique:
 
     def make_vector(self, image: Image, mask: Mask | None) -> Singles:
         """Make the vector of a uint8 image (H, W[, 3]): float32 (D,). Pixels where `mask` bool (H, W) is False must
-        have no influence (None: all count)."""
+        have no influence (None: use all)."""
         raise NotImplementedError
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. The quality is
-        1, or 0 if all numbers are 0 in half precision. Raises ModelError for values beyond half precision."""
+        1, or 0 if all values are 0 in half precision. Raises ModelError for values beyond half precision."""
         vector = self.make_vector(image, mask)
         length = float(np.linalg.norm(vector))
         if self._similarity == "cosine":
@@ -115,7 +115,7 @@ class VectorTechnique:
         """Compare a query with the `rows` (N, *row shape) of all places; `mean` (D,) is the map's mean. Returns scores
         float32 (N,), all 0 for an all-zero query, and None (no hypotheses)."""
         vector = query.coarse.astype(np.float32)
-        if not vector.any():  # minus the mean, zeros would resemble some place, and equal other zeros
+        if not vector.any():  # after subtraction of the mean, zeros would resemble some places
             return np.zeros(len(rows), np.float32), None
         if mean is not None and self.spec.form != "float":
             vector -= mean
@@ -131,12 +131,12 @@ class VectorTechnique:
         return scores, None
 
     def _score_bits(self, vector: Singles, rows: Bytes) -> Singles:
-        """Return the share of equal bits between a vector and each of n places, uint8 (n, B): float32 (n,)."""
+        """Return the fraction of equal bits of a vector and each of n places, uint8 (n, B): float32 (n,)."""
         code = np.zeros(self.spec.row.shape, np.uint8)
         code[: -(-self._length // 8)] = np.packbits(vector > 0)
         query, places = code.view(np.uint64), np.ascontiguousarray(rows).view(np.uint64)
         differing_bits: Ints = np.empty(len(rows), np.uint16 if 8 * len(code) < 1 << 16 else np.uint32)
-        ones = np.ones(len(query), np.float32)  # a product is the fastest sum, and exact for integers below 2^24
+        ones = np.ones(len(query), np.float32)  # a matrix product is the fastest sum, and exact below 2^24
         block_places = max(1, _CODE_BLOCK_BYTES // len(code))
         for start in range(0, len(rows), block_places):
             block = slice(start, start + block_places)
@@ -179,7 +179,7 @@ class Hog(VectorTechnique):
         super().__init__("hog", length, parameters={"w1": w1, "cell": cell, "bins": bins}, form=form, margins=margins)
 
     def make_vector(self, image: Image, mask: Mask | None) -> Singles:
-        """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False do not count."""
+        """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are ignored."""
         grey = make_grey_square(image, self._w1)
         allowed = make_mask_square(mask, self._w1)
         cells = compute_histograms(grey, self._cell, self._bins, signed=False, allowed=allowed)

@@ -3,7 +3,7 @@
 A query of a camera that looks straight down is compared with a place under several *hypotheses*: a height ratio (the
 camera's height above the ground divided by that when the place was mapped) and a rotation of the camera since then, in
 steps of 15 degrees. A view undoes both. Few regions agree by chance more easily than many. Factors, measured with
-foreign pictures of the aerial tuning sets, make the shares of agreeing votes comparable."""
+foreign pictures of the aerial tuning sets, make the fractions of agreeing votes comparable."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from edgevpr.techniques.layout import ROTATIONS
 HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
 QUARTERS = 4
 STEPS_PER_QUARTER = ROTATIONS // QUARTERS
-_CHANCE_EXPONENT = 0.72  # the share that agrees by chance falls with this power of the number of regions
-_LARGER_VIEW_FACTORS = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
+_CHANCE_EXPONENT = 0.72  # the fraction that agrees by chance falls with this power of the number of regions
+_LARGER_VIEW_FACTORS = {1.42: 0.87, 2.0: 0.8}  # a larger view has more shifts at which votes can agree by chance
 
 # Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of
 # this many pixels. Returns blocks float32 (n, n, 4 bins), and bool (n, n), True for good blocks.
@@ -31,11 +31,11 @@ Describe = Callable[[Singles], Singles]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRegions:
-    """The good regions of a view, to be compared with a place: their `numbers` int (G,), row by row on a grid of `side`
-    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `factor`: the score is the share of
-    agreeing votes times this factor (see above)."""
+    """The good regions of a view, to be compared with a place: their `indices` int (G,), row-major on a grid of `side`
+    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `factor`: the score is the fraction
+    of agreeing votes times this factor (see above)."""
 
-    numbers: Ints
+    indices: Ints
     regions: Singles
     side: int
     factor: float
@@ -48,7 +48,7 @@ def decode_hypothesis(number: int) -> tuple[float, int]:
 
 def count_cells(cells: int, ratio: float) -> int:
     """Return the number of cells along one side of a view of height ratio `ratio`, for a place with `cells` along one
-    side. The two differ by an even number, so that the middle region of the view is on that of the place."""
+    side. The two differ by an even number, so that the middle regions of view and place coincide."""
     return cells + 2 * round(cells * (ratio - 1) / 2)
 
 
@@ -71,10 +71,10 @@ class QueryViews:
         self._scaled: dict[float, tuple[Array, Array]] = {}
         self.structure: Singles | None = None  # of the unchanged view (see `overlay`)
         self._regions: dict[tuple[int, Describe], ViewRegions] = {}
-        self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
+        self.fields: dict[tuple[int, int], Singles] = {}  # layouts by (hypothesis, grid side)
 
     def discard_other_heights(self, ratio: float) -> None:
-        """Discard the views of other height ratios, except the unchanged one: they take megabytes."""
+        """Discard the views of other height ratios, which take megabytes, except the unchanged one."""
         self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
         self._scaled = {key: picture for key, picture in self._scaled.items() if key == ratio}
         self._regions = {key: view for key, view in self._regions.items() if decode_hypothesis(key[0])[0] == ratio}
@@ -95,14 +95,14 @@ class QueryViews:
         if (number, describe) not in self._regions:
             ratio, turn = decode_hypothesis(number)
             blocks, good = self.make_blocks(ratio, turn)
-            side = max(count_cells(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
+            side = max(count_cells(self._side + 1, ratio) - 1, self._side)  # regions per side, at least a place's
             if ratio > 1:
                 area_ratio = compute_scale(self._side + 1, ratio) ** 2  # relative to the place
                 factor = area_ratio * _LARGER_VIEW_FACTORS[ratio]  # at most one in `area_ratio` votes can agree
             else:
                 factor = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _CHANCE_EXPONENT)
             self._regions[number, describe] = ViewRegions(
-                numbers=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
+                indices=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
                 regions=describe(blocks[good]),
                 side=side,
                 factor=factor,

@@ -1,4 +1,4 @@
-"""Learned visual words, and the vectors made with them: VLAD (Jégou et al., CVPR 2010) and the bag of words.
+"""Learned visual words, and the vectors made from them: VLAD (Jégou et al., CVPR 2010) and the bag of words.
 `train_words.py` in models/recipes/ writes the files of words."""
 
 import hashlib
@@ -17,15 +17,15 @@ _TINY = 1e-12
 
 
 def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
-    """Load the `count` words of `kind` ("vlad", "regions", "bow") learned on the feature map of the card `model`.
-    Returns them, float32 (K, D), and the hash of network and words together, which a map stores. Raises ModelError,
+    """Load the `count` words of `kind` ("vlad", "regions", "bow"), learned on the feature map of the card `model`.
+    Returns them, float32 (K, D), and the combined hash of network and words, which a map stores. Raises ModelError,
     with the command that makes the file, if it is missing, damaged, or for another network (see `Card.fingerprint`)."""
     name = f"{model}_{kind}{count}.npz"
     recipe = "python models/recipes/train_words.py"
     command = f"make it with `{recipe} --images DIR --model {model} --kind {kind} --count {count}` in a checkout"
     path = find_model(name)
     if path is None:
-        raise ModelError(f"The visual vocabulary {name} is not in the models folders: {command}.")
+        raise ModelError(f"The visual vocabulary {name} was not found in any models folder: {command}.")
     try:
         content = read_file(path, _MAX_FILE_BYTES)
         with np.lib.npyio.NpzFile(io.BytesIO(content)) as file:
@@ -33,10 +33,10 @@ def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
         words = arrays["words"].astype(np.float32)
     except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise ModelError(f"{path} cannot be read as a visual vocabulary ({error}): {command}.") from error
-    learned_on, fingerprint = str(arrays.get("model_sha256")), load_card(model).fingerprint
-    if learned_on != fingerprint:
-        networks = f"({learned_on[:12]}...) than the current `{model}` ({fingerprint[:12]}...)"
-        raise ModelError(f"{name} was trained with a different network {networks}: {command}.")
+    trained_on, fingerprint = str(arrays.get("model_sha256")), load_card(model).fingerprint
+    if trained_on != fingerprint:
+        details = f"({trained_on[:12]}...) than the current `{model}` ({fingerprint[:12]}...)"
+        raise ModelError(f"{name} was trained with a different network {details}: {command}.")
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
         raise ModelError(f"{name} must have {count} words, but has an array of shape {words.shape}: {command}.")
     sha256 = hashlib.sha256((fingerprint + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
@@ -79,8 +79,8 @@ def compute_soft_weights(local: Singles, words: Singles, sharpness: float) -> Si
 
 
 def compute_sharpness(words: Singles) -> float:
-    """Compute the sharpness for `compute_soft_weights` with which a descriptor equal to a word gives it, on average,
-    100 times the weight of the nearest other word, as NetVLAD (section 5, "Training") requires of the training
+    """Compute the sharpness for `compute_soft_weights` at which a descriptor equal to a word gives that word, on
+    average, 100 times the weight of the nearest other word, as NetVLAD (section 5, "Training") requires of the training
     descriptors."""
     squares = np.einsum("kd,kd->k", words, words)
     distances = squares[:, None] + squares - 2 * words @ words.T
@@ -90,16 +90,16 @@ def compute_sharpness(words: Singles) -> float:
 
 def compute_bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
-    L2-normalised: float32 (K,). Counts find fewer places: many channels respond to the same part of an image."""
+    L2-normalised: float32 (K,). Counts recognise fewer places: many channels respond to the same part of an image."""
     present = np.zeros(len(words), np.float32)
     present[find_nearest(local, words)] = 1
     return normalise_rows(present)
 
 
 def find_nearest(local: Singles, words: Singles) -> Ints:
-    """Return the number of the word nearest to each descriptor, the first one in a tie: (N, D), (K, D) to int (N,)."""
-    numbers: Ints = _compute_closeness(local, words).argmax(axis=1)
-    return numbers
+    """Return the index of the word nearest to each descriptor, the first one in a tie: (N, D), (K, D) to int (N,)."""
+    indices: Ints = _compute_closeness(local, words).argmax(axis=1)
+    return indices
 
 
 def _compute_closeness(local: Singles, words: Singles) -> Singles:

@@ -23,7 +23,7 @@ from edgevpr.techniques.session import open_backbone
         ("region_vlad", {"regions": 0}, UsageError, "region_vlad: regions is 0"),
         ("region_vlad", {"words": 7}, ModelError, "--kind regions --count 7"),
         ("cross_region_bow", {"words": 7}, ModelError, "--kind bow --count 7"),
-        ("rmac", {"form": "2bit"}, UsageError, "rmac has no form `2bit`"),
+        ("rmac", {"form": "2bit"}, UsageError, "rmac cannot store vectors as `2bit`"),
         ("rmac", {"model": "kalc"}, ModelError, "did you mean `calc`"),
     ],
 )

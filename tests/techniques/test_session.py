@@ -62,7 +62,7 @@ def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, sa
         (
             {"sha256": "0" * 64},
             "features",
-            "does not match its card: its SHA-256 is [0-9a-f]{64}, and the card expects 0",
+            "does not match its card: its SHA-256 is [0-9a-f]{64}, but the card expects 0",
         ),
         ({"file": "gone.onnx"}, "features", "gone.onnx cannot be read"),
     ],

@@ -57,7 +57,7 @@ def test_encode_leaves_out_masked_pixels(name, parameters):
         ("cohg", {}, "There is no technique `cohg`"),
         ("cohog", {"gtt": 1}, "did you mean `gt`"),
         ("cohog", {"gt": "much"}, "must be a number"),
-        ("cohog", {"gt": 7}, "share of the largest entropy"),
+        ("cohog", {"gt": 7}, "fraction of the largest entropy"),
         ("cohog", {"w2": 100}, "multiple of w2"),
         ("cohog", {"entropy": "renyi"}, "filled_bins or shannon"),
         ("cohog", {"matching": "magic"}, "displacement or thesis"),

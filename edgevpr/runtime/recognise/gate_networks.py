@@ -19,7 +19,7 @@ import numpy as np
 from edgevpr.core.arrays import Floats, Image, Ints, Mask, Singles
 from edgevpr.core.errors import ModelError
 from edgevpr.techniques.card import Card, InputRule
-from edgevpr.techniques.session import compute_fill_shares, open_session, prepare_input, run_outputs
+from edgevpr.techniques.session import compute_fill_fractions, open_session, prepare_input, run_outputs
 
 CROPS = 5  # along each side; the thesis's C is 5x5
 _TEST_SEED = 7
@@ -105,7 +105,7 @@ class Detector:
             ) from error
         boxes = boxes[scores >= self._rule.min_score]
         height, width = image.shape[:2]
-        across, down = compute_fill_shares(image, rule)
+        across, down = compute_fill_fractions(image, rule)
         size = np.array([width / across, height / down] * 2)
         top_left, bottom_right = np.floor(boxes[:, :2] * size[:2]), np.ceil(boxes[:, 2:] * size[:2])
         return np.hstack([top_left, bottom_right]).clip(0, [width, height] * 2).astype(int)
