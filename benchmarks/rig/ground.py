@@ -114,7 +114,7 @@ def moved_map(place_map: Path, east_m: float, up_m: float) -> Path:
     if not path.exists():
         unfinished = path.with_name(f"{os.getpid()}-{path.name}")
         shutil.copy(place_map, unfinished)
-        with PlaceMap.open_for_adding(unfinished) as places, places.transaction():
+        with PlaceMap.open_for_writing(unfinished) as places, places.transaction():
             for place in list(places.read_places()):
                 at = place.position
                 lat_deg, lon_deg = offset_position(at.lat_deg, at.lon_deg, east_m, 0.0)

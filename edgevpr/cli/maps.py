@@ -180,7 +180,7 @@ def run_map_refine(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 
-    with PlaceMap.open_for_adding(args.map) as place_map:
+    with PlaceMap.open_for_writing(args.map) as place_map:
         refined = refine_map(place_map, create_technique(place_map), args.images, progress)
     print_result({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
     return 0
@@ -191,7 +191,7 @@ def run_map_move(args: Namespace) -> int:
     from edgevpr.mapmaking.moving import move_map
     from edgevpr.places.mapfile import PlaceMap
 
-    with PlaceMap.open_for_adding(args.map) as place_map:
+    with PlaceMap.open_for_writing(args.map) as place_map:
         move = move_map(place_map, args.by)
     print_result({"map": args.map, **asdict(move)}, args.json, format_move(args.map, move))
     return 0
@@ -204,7 +204,7 @@ def run_map_calibrate(args: Namespace) -> int:
     from edgevpr.runtime.recognise.opening import create_technique
 
     config, pictures = make_config(args, args.config), _parse_pictures(args)
-    with PlaceMap.open_for_adding(args.map) as place_map:
+    with PlaceMap.open_for_writing(args.map) as place_map:
         encoder = make_encoder(config.source, pictures, create_technique(place_map))
         calibration = calibrate_map(place_map, encoder, config.match, pictures, progress)
     fields = {"map": args.map, "calibration": calibration.figures()}

@@ -77,7 +77,7 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
     path, board, pictures = parse_map_path(plan.path), load_board("this"), plan.pictures
     source_config, salience = config.source, config.salience
     is_new = not (plan.append and path.exists())
-    place_map = None if is_new else PlaceMap.open_for_adding(path)
+    place_map = None if is_new else PlaceMap.open_for_writing(path)
     source: Source
     counts: dict[str, int] = {}
     if isinstance(pictures, FlightPictures):

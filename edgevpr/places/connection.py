@@ -23,7 +23,7 @@ _MAX_METADATA_BYTES = 100_000  # of a row without its descriptor: mostly the ima
 
 
 class MapConnection:
-    """A connection to a map file. Create it with `create`, `open` or `open_for_adding`, and close it or use `with`.
+    """A connection to a map file. Create it with `create`, `open` or `open_for_writing`, and close it or use `with`.
 
     `stored` holds the values of the table edgevpr_map (see `mapspec`), and `spec` describes the technique that made the
     descriptors. `db` is the current SQLite connection: `require_unchanged` may replace it.
@@ -72,7 +72,7 @@ class MapConnection:
         return cls._open(path, is_writable=False)
 
     @classmethod
-    def open_for_adding(cls, path: str | Path) -> "Self":
+    def open_for_writing(cls, path: str | Path) -> "Self":
         """Open an existing map to add places. Raises the errors of `open`, and MapBusyError if another program has it
         open for writing."""
         return cls._open(mapfiles.require_map_file(path), is_writable=True)

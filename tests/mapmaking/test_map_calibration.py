@@ -58,7 +58,7 @@ def few(monkeypatch):
 
 @pytest.fixture
 def place_map(tmp_path):
-    with PlaceMap.open_for_adding(map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)))) as place_map:
+    with PlaceMap.open_for_writing(map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)))) as place_map:
         yield place_map
 
 
@@ -109,7 +109,7 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
         return Levelling(Lens(60.0), below=True, is_live=False)
 
     path = map_of(tmp_path / "m.gpkg", down, tilted, levelling=levelling())
-    with PlaceMap.open_for_adding(path) as place_map:
+    with PlaceMap.open_for_writing(path) as place_map:
         with pytest.raises(UsageError, match=" 0 places"):
             calibrated(place_map, at_hand(tilted[0])[0], down)
         found = calibrated(place_map, at_hand(*tilted)[0], down, levelling=levelling())
@@ -124,7 +124,7 @@ def test_build_map_counts_tilted_images_by_what_is_missing(tmp_path, pitch_deg, 
     path = map_of(tmp_path / "down.gpkg", down, [])
     pose = {"roll_deg": 0.0, "pitch_deg": pitch_deg, "heading_deg": heading_deg, "height_m": 90.0}
     encoder = FrameEncoder(technique=down, levelling=Levelling(Lens(60.0), below=True, is_live=False))
-    with PlaceMap.open_for_adding(path) as place_map:
+    with PlaceMap.open_for_writing(path) as place_map:
         result = build_map([frame(0, **pose)], encoder, place_map)
     assert (result.tilted, result.without_heading) == left_out
     assert result.added == 1 - sum(left_out)
@@ -140,7 +140,7 @@ def test_a_map_that_looks_alike_everywhere_says_so(tmp_path):
         image = np.clip(waves + noise, 0, 255).astype(np.uint8)
         return Frame(image=image, name=f"{number}.png", t_mono_s=0.0, position=Position(50 + 0.002 * number, 8.0))
 
-    with PlaceMap.open_for_adding(map_of(tmp_path / "m.gpkg", AHEAD, map(water, range(PLACES)))) as place_map:
+    with PlaceMap.open_for_writing(map_of(tmp_path / "m.gpkg", AHEAD, map(water, range(PLACES)))) as place_map:
         found = calibrated(place_map, at_hand(*map(water, range(PLACES)))[0])
     assert found.looks_alike
     assert found.accepted < 0.3

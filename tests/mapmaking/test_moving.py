@@ -82,7 +82,7 @@ def test_a_scale_is_taken_back_around_the_middle_of_the_flight(path, capsys):
 def test_the_same_log_moves_a_map_once(path):
     log = log_of(path, FOUND)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
-    with PlaceMap.open_for_adding(path) as place_map, pytest.raises(UsageError, match="moved since"):
+    with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match="moved since"):
         move_map(place_map, log)
 
 
@@ -95,10 +95,10 @@ def test_a_log_that_does_not_say_where_the_map_lies_moves_nothing(path, lines, c
 
 
 def test_a_damaged_place_stops_the_whole_move(path):
-    with PlaceMap.open_for_adding(path) as place_map, place_map.transaction():
+    with PlaceMap.open_for_writing(path) as place_map, place_map.transaction():
         place_map.db.execute("UPDATE places SET heading_deg = 'north' WHERE place_id = 2")
     log, before = log_of(path, FOUND), places_of_first(path)
-    with PlaceMap.open_for_adding(path) as place_map, pytest.raises(PlaceError):
+    with PlaceMap.open_for_writing(path) as place_map, pytest.raises(PlaceError):
         move_map(place_map, log)
     assert places_of_first(path) == before
 

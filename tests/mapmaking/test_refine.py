@@ -117,7 +117,7 @@ def test_refine_moves_places_to_where_their_pictures_lie(flown, map_path, capsys
 @pytest.mark.parametrize("wrong", [lambda lat, lon: (lon, lat), lambda lat, lon: (lat, -lon)])
 def test_refine_notices_exchanged_lat_and_lon_and_a_lost_sign(map_path, capsys, wrong):
     east_deg = 120.0  # the flight is moved to where its longitude could be a latitude
-    with PlaceMap.open_for_adding(map_path) as place_map, place_map.transaction():
+    with PlaceMap.open_for_writing(map_path) as place_map, place_map.transaction():
         for place in list(place_map.read_places()):
             lat_deg, lon_deg = wrong(place.position.lat_deg, place.position.lon_deg - east_deg)
             place_map.move_place(place.place_id, Position(lat_deg, lon_deg), None)
@@ -159,7 +159,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
 
 
 def refined_of(path, images=None):
-    with PlaceMap.open_for_adding(path) as place_map:
+    with PlaceMap.open_for_writing(path) as place_map:
         technique = create_technique(place_map)
         return refine(place_map, technique, iterate_silently, images), list(place_map.read_places())
 
@@ -236,7 +236,7 @@ def test_refine_leaves_a_place_that_cannot_be_read(map_path):
         "UPDATE places SET landmarks = x'00' WHERE place_id = 3",
         "UPDATE places SET up_deg = 5, pose_crc32 = 1 WHERE place_id = 5",
     )
-    with PlaceMap.open_for_adding(map_path) as place_map:
+    with PlaceMap.open_for_writing(map_path) as place_map:
         found = refine(place_map, create_technique(place_map), iterate_silently)
     assert found.places == 27
     assert found.refined >= 25

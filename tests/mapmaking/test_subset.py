@@ -95,7 +95,7 @@ def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path)
 def test_map_subset_of_several_calibrated_maps_is_not_calibrated_and_says_so(tiles, tmp_path, capsys):
     shutil.copytree(tiles, tmp_path / "tiles")
     for path in (tmp_path / "tiles").iterdir():
-        with PlaceMap.open_for_adding(path) as place_map:
+        with PlaceMap.open_for_writing(path) as place_map:
             place_map.record_calibration("of this map")
     out, (lat_deg, lon_deg) = tmp_path / "f.gpkg", at(200, 200)
     one, several = tmp_path / "tiles" / "0.gpkg", tmp_path / "tiles"

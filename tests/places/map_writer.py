@@ -48,6 +48,6 @@ def write_sql(path: Path, *statements: str) -> None:
 
 if __name__ == "__main__":
     path, start = sys.argv[1], int(sys.argv[2])
-    place_map = PlaceMap.open_for_adding(path)
+    place_map = PlaceMap.open_for_writing(path)
     for number in range(start, start + 100_000):
         print(place_map.add(frame(number), descriptor(number)), flush=True)

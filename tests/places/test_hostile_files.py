@@ -33,7 +33,7 @@ def map_path(valley, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["", "a\0b.gpkg", "\ud800.gpkg", "/"])
-@pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_adding, lambda path: PlaceMap.create(path, SPEC)])
+@pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_writing, lambda path: PlaceMap.create(path, SPEC)])
 def test_place_map_refuses_a_name_that_no_file_can_have(use, name):
     with pytest.raises(UsageError):
         use(name)
@@ -47,7 +47,7 @@ def test_place_map_takes_a_name_that_is_not_utf_8(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["", "-wal", "-journal"])
-@pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_adding])
+@pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_writing])
 def test_place_map_refuses_a_pipe_and_does_not_wait_for_it(map_path, use, end):
     path = map_path.with_name(map_path.name + end)
     path.unlink(missing_ok=True)
@@ -93,7 +93,7 @@ for _key, _value in WRONG_VALUES:
 @pytest.mark.parametrize(("change", "says"), TAMPERED.items(), ids=range(len(TAMPERED)))
 def test_place_map_refuses_a_map_that_was_tampered_with_in_a_sentence(map_path, change, says):
     write_sql(map_path, change)
-    for use in (PlaceMap.open, PlaceMap.open_for_adding):
+    for use in (PlaceMap.open, PlaceMap.open_for_writing):
         with pytest.raises(MapError, match=says) as caught:
             use(map_path)
         assert len(str(caught.value)) < 1500
@@ -156,7 +156,7 @@ def test_place_map_leaves_out_a_place_with_a_large_value(map_path):
 def test_place_map_keeps_a_place_whose_name_and_time_cannot_be_written(map_path):
     odd = dataclasses.replace(frame(41), name=os.fsdecode(b"\xff\xfe.jpg"), t_utc_s=1.7e12)
     later = dataclasses.replace(frame(42), name="\ud800.jpg", t_utc_s=1e308)
-    with PlaceMap.open_for_adding(map_path) as place_map:
+    with PlaceMap.open_for_writing(map_path) as place_map:
         for number, each in ((41, odd), (42, later)):
             place_map.add(each, descriptor(number))
             (place_id,) = place_map.select_ids("source_image")[(escape_name(each.name),)]
@@ -167,14 +167,14 @@ def test_place_map_keeps_a_place_whose_name_and_time_cannot_be_written(map_path)
 
 
 def test_open_for_adding_admits_one_program_at_a_time(map_path):
-    with PlaceMap.open_for_adding(map_path) as place_map:
+    with PlaceMap.open_for_writing(map_path) as place_map:
         second = subprocess.run(
             [sys.executable, map_writer.__file__, str(map_path), "1"], capture_output=True, text=True, timeout=60
         )
         assert "MapBusyError" in second.stderr
         with PlaceMap.open(map_path) as reader:  # to look is allowed
             assert len(reader) == len(place_map) == PLACES
-    with PlaceMap.open_for_adding(map_path) as again:
+    with PlaceMap.open_for_writing(map_path) as again:
         again.add(frame(41), descriptor(41))
 
 
@@ -185,7 +185,7 @@ def test_open_for_adding_serves_the_triggers_of_a_spatial_index(map_path):
         "CREATE TRIGGER indexed AFTER INSERT ON places WHEN NOT ST_IsEmpty(NEW.geom) BEGIN "
         "INSERT INTO boxes VALUES (ST_MinX(NEW.geom), ST_MaxY(NEW.geom)); END",
     )
-    with PlaceMap.open_for_adding(map_path) as place_map:
+    with PlaceMap.open_for_writing(map_path) as place_map:
         place_map.add(frame(41), descriptor(41))
         place_map.add(frame(45), descriptor(45))  # without a position
         assert place_map.db.execute("SELECT * FROM boxes").fetchall() == [(8.0, pytest.approx(50.0041))]

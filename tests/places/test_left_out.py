@@ -42,7 +42,7 @@ def maps(tmp_path_factory):
 def opened(technique, maps, tmp_path):
     """A technique, its map, and the index."""
     path = shutil.copy(maps / type(technique).__name__, tmp_path / "m.gpkg")
-    with PlaceMap.open_for_adding(path) as place_map:
+    with PlaceMap.open_for_writing(path) as place_map:
         yield technique, place_map, load_index(place_map, technique, 10_000)
 
 

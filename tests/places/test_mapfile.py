@@ -78,7 +78,7 @@ def test_gdal_reads_the_places(map_path):
 
 
 def test_sqlite_full_says_make_room(map_path):
-    place_map = PlaceMap.open_for_adding(map_path)
+    place_map = PlaceMap.open_for_writing(map_path)
     (pages,) = place_map.db.execute("PRAGMA page_count").fetchone()
     place_map.db.execute(f"PRAGMA max_page_count = {pages + 1}")
     with pytest.raises(MapError, match="disk"):
@@ -135,7 +135,7 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
 
 @pytest.mark.parametrize("value", ["''", "'7'", "'null'", "'{'", f"'{'[' * 100_000}'", "x'ff'"], ids=range(6))
 def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
-    with PlaceMap.open_for_adding(map_path) as place_map:
+    with PlaceMap.open_for_writing(map_path) as place_map:
         assert (place_map.mask_sha256, place_map.calibration) == (None, None)
         place_map.record_mask("m")
         place_map.record_calibration("how sure")
@@ -148,7 +148,7 @@ def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
 
 
 def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_known_of_them(map_path, tmp_path):
-    with PlaceMap.open_for_adding(map_path) as place_map:
+    with PlaceMap.open_for_writing(map_path) as place_map:
         place_map.record_mask("m")
         place_map.record_lens("/camera/lens.yaml")
         place_map.record_calibration("how sure")

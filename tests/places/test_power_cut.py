@@ -44,7 +44,7 @@ def test_a_log_that_ends_anywhere_keeps_every_place_that_was_in_it_whole_and_tak
         path = copied(killed, tmp_path / str(cut), log[:cut] + bytes(len(log) - cut if rest == "zeros" else 0))
         kept[cut] = places_of(path)
         if cut % 10 == 0:
-            with PlaceMap.open_for_adding(path) as place_map:
+            with PlaceMap.open_for_writing(path) as place_map:
                 place_map.add(frame(kept[cut]), descriptor(kept[cut]))
             assert places_of(path) == kept[cut] + 1
     assert list(kept.values()) == sorted(kept.values()), "what is longer holds no less"

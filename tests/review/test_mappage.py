@@ -34,7 +34,7 @@ def mapped(tmp_path_factory):
     write_positions(folder / "ref" / "positions.csv", tags)
     argv = ["map", "build", folder / "valley.gpkg", "--images", folder / "ref", "--camera", "nadir", "--no-refine"]
     assert main([*map(str, argv), "--no-calibrate", "--technique", "cohog"]) == 0
-    with PlaceMap.open_for_adding(folder / "valley.gpkg") as place_map, place_map.transaction():
+    with PlaceMap.open_for_writing(folder / "valley.gpkg") as place_map, place_map.transaction():
         for place in places:
             recorded = Position(*position(9.0, 90.0)) if place.place_id == 3 else place.position
             place_map.move_place(place.place_id, place.position, replace(place.pose, recorded=recorded))

@@ -56,7 +56,7 @@ def path(built, tmp_path):
 
 
 def keep(path, text):
-    with PlaceMap.open_for_adding(path) as place_map:
+    with PlaceMap.open_for_writing(path) as place_map:
         place_map.record_calibration(text)
 
 

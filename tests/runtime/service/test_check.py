@@ -135,7 +135,7 @@ def test_check_of_an_unknown_board_does_not_open_the_map(settings, config_file):
 def test_check_reports_places_beyond_the_budget(settings, config_file):
     big = config_file.with_name("big.gpkg")
     shutil.copy(settings["map"], big)
-    with PlaceMap.open_for_adding(big) as place_map:
+    with PlaceMap.open_for_writing(big) as place_map:
         frame, technique = Frame(image=textured(3), name="3.png", t_mono_s=0.0), techniques.create("hog")
         descriptor = technique.encode(frame.image)
         while len(place_map) * technique.spec.coarse.nbytes < 1e6:
