@@ -139,7 +139,7 @@ class MachineLoad:
     """Load of the machine: the utilisation of each core, 0..1, since the last call of `measure_machine_load`, and RAM
     in bytes."""
 
-    core_shares: tuple[float, ...]
+    core_usage: tuple[float, ...]
     ram_used_bytes: int
     ram_total_bytes: int
 

@@ -166,7 +166,7 @@ def test_place_map_keeps_a_place_whose_name_and_time_cannot_be_written(map_path)
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)
 
 
-def test_open_for_adding_admits_one_program_at_a_time(map_path):
+def test_open_for_writing_admits_one_program_at_a_time(map_path):
     with PlaceMap.open_for_writing(map_path) as place_map:
         second = subprocess.run(
             [sys.executable, map_writer.__file__, str(map_path), "1"], capture_output=True, text=True, timeout=60
@@ -178,7 +178,7 @@ def test_open_for_adding_admits_one_program_at_a_time(map_path):
         again.add(frame(41), descriptor(41))
 
 
-def test_open_for_adding_serves_the_triggers_of_a_spatial_index(map_path):
+def test_open_for_writing_serves_the_triggers_of_a_spatial_index(map_path):
     write_sql(
         map_path,
         "CREATE TABLE boxes (x DOUBLE, y DOUBLE)",

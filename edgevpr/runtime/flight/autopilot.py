@@ -210,7 +210,7 @@ class AutopilotOutput:
             self._report_output()
             self._link.send(
                 messages.make_computer_status(
-                    self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
+                    self._clock.mono_s(), load.core_usage, load.ram_used_bytes, load.ram_total_bytes, temperature_c
                 )
             )
 

@@ -168,7 +168,7 @@ class Vitals:
             "failed": tally.failed + tally.unusable,
             "asked_rate_hz": self._pace.rate_hz,
             "rss_mb": parts.io.machine.rss_mb(),
-            "machine_cpu_share": sum(load.core_shares) / max(1, len(load.core_shares)),
+            "machine_cpu_share": sum(load.core_usage) / max(1, len(load.core_usage)),
             "machine_ram_mb": load.ram_used_bytes / 1e6,
             "machine_ram_total_mb": load.ram_total_bytes / 1e6,
             "used_mah": totals["used_mah"],
