@@ -1,6 +1,7 @@
 """`edgevpr run` as a process of its own, looked at from outside: its log, its memory, its CPU time."""
 
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -51,14 +52,32 @@ def simulated_autopilot(**how):
         autopilot.finish()
 
 
-def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:
-    """The first line of a kind in the flight log, as soon as it is there. Raises RuntimeError where none comes."""
+def ended(process: subprocess.Popen, code: int = 0) -> str:
+    """Wait for the end of a flight, which must be with this code; return what it has said."""
+    said = process.communicate(timeout=120)[1]
+    assert process.returncode == code, said
+    return said
+
+
+@contextmanager
+def manager(folder: Path):
+    """systemd's end of the socket, and the environment that names it."""
+    address = str(folder / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(address)
+        listening.settimeout(60)
+        yield listening, {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"}
+
+
+def wait_for(kind: str, log: Path, process: subprocess.Popen, count: int = 1) -> dict[str, Any]:
+    """The line of a kind in the flight log with this number, as soon as it is there. Raises RuntimeError where none
+    comes."""
     give_up_s = time.monotonic() + _PATIENCE_S
     while time.monotonic() < give_up_s:
         over = process.poll() is not None
-        line = next((line for line in read_log(log) if line["kind"] == kind), None) if log.exists() else None
-        if line is not None:
-            return line
+        lines = [line for line in read_log(log) if line["kind"] == kind] if log.exists() else []
+        if len(lines) >= count:
+            return lines[count - 1]
         if over:
             raise RuntimeError(f"the flight has ended without a line `{kind}`: {process.communicate()[1]}")
         time.sleep(0.02)

@@ -2,8 +2,8 @@
 
 import math
 
-import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.mavlink import messages
@@ -129,19 +129,10 @@ def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airfram
     heard = sent_and_received(messages.make_odometry(STATE, STATE.attitude, origin, 7.0))
     assert (heard.frame_id, heard.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     assert (heard.x, heard.y, heard.z) == pytest.approx((-300.0, 200.0, -12.3), abs=0.1)
-    w, x, y, z = heard.q
-    earth_from_body = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    assert math.atan2(earth_from_body[1, 0], earth_from_body[0, 0]) == pytest.approx(1.3, abs=1e-6), "the yaw"
-    assert math.atan2(earth_from_body[2, 1], earth_from_body[2, 2]) == pytest.approx(0.1, abs=1e-6), "the roll"
-    assert -math.asin(earth_from_body[2, 0]) == pytest.approx(-0.2, abs=1e-6), "the pitch"
-    velocity = earth_from_body @ (heard.vx, heard.vy, heard.vz)
-    assert velocity == pytest.approx((-4.0, 3.0, 0.5), abs=1e-5)
+    w, *axis = heard.q
+    earth_from_body = Rotation.from_quat((*axis, w))
+    assert earth_from_body.as_euler("ZYX") == pytest.approx((1.3, -0.2, 0.1), abs=1e-6), "yaw, pitch, roll"
+    assert earth_from_body.apply((heard.vx, heard.vy, heard.vz)) == pytest.approx((-4.0, 3.0, 0.5), abs=1e-5)
     # As ArduPilot reads them (GCS_MAVLINK::handle_odometry).
     position, angle = (math.fsum(heard.pose_covariance[each] ** 2 for each in at) for at in ((0, 6, 11), (15, 18, 20)))
     assert position ** (1 / 3) == pytest.approx(2.5)

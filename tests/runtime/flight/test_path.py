@@ -1,9 +1,8 @@
 """A path: velocities or accelerations summed up, at any time of the last seconds."""
 
-import math
-
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edgevpr.core.types import Position
 from edgevpr.runtime.flight.path import HISTORY_S, Path, to_ground_acceleration
@@ -33,13 +32,7 @@ def test_a_silence_breaks_a_path():
 @pytest.mark.parametrize("yaw_deg", [0.0, 77.0, -160.0])
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (30.0, 0.0), (0.0, -20.0), (-35.0, 12.0)])
 def test_what_accelerometers_feel_without_gravity_is_the_acceleration_over_the_ground(roll_deg, pitch_deg, yaw_deg):
-    roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
-    about = {
-        "x": [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]],
-        "y": [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]],
-        "z": [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]],
-    }
-    earth_from_body = np.array(about["z"]) @ about["y"] @ about["x"]
+    earth_from_body = Rotation.from_euler("ZYX", (yaw_deg, pitch_deg, roll_deg), degrees=True)
     north, east, down = 1.2, -0.7, 0.3
-    felt = earth_from_body.T @ (np.array([north, east, down]) - [0, 0, 9.81])
+    felt = earth_from_body.inv().apply((north, east, down - 9.81))
     assert np.allclose(to_ground_acceleration(tuple(felt), roll_deg, pitch_deg, yaw_deg), (east, north))

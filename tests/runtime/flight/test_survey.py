@@ -10,7 +10,7 @@ from air import HOME, match_at
 from fakes import FakeClock, FakeLink, receiver_at, vehicle_at
 
 from edgevpr.core.config import load_config
-from edgevpr.core.geodesy import move_position, offset_m, offset_position
+from edgevpr.core.geodesy import move_position, offset_m, offset_position, picture_axes
 from edgevpr.core.types import Position
 from edgevpr.frames.level import STRAIGHT_DOWN, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -64,13 +64,8 @@ def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said
     for t_s in map(float, range(seconds)):
         at_m, heading_deg = way(t_s)
         after_m, _ = way(t_s + 0.01)
-        heading = math.radians(heading_deg)
-        ahead, right = (
-            np.array([math.sin(heading), math.cos(heading)]),
-            np.array([math.cos(heading), -math.sin(heading)]),
-        )
         gps_off_m = (1 - 1 / GPS_LASTS_S) * gps_off_m + rng.normal(0, GPS_SD_M * math.sqrt(2 / GPS_LASTS_S), 2)
-        mount_m = HEIGHT_M * (math.tan(math.radians(AHEAD_DEG)) * ahead + math.tan(math.radians(RIGHT_DEG)) * right)
+        mount_m = HEIGHT_M * picture_axes(heading_deg) @ np.tan(np.radians((RIGHT_DEG, AHEAD_DEG)))
         fix_m = at_m + OFF_M + scale * at_m + mount_m + rng.normal(0, FIX_SD_M, 2)
         if rng.random() < wrong:
             fix_m = fix_m + rng.normal(0, 150, 2)
@@ -175,13 +170,8 @@ def test_a_position_that_may_be_ours_is_not_gps():
 
 def levelled(event, mount, was):
     """The position of a match if its picture is levelled by another mount than it was."""
-    heading = math.radians(event.vehicle.heading_deg)
-    ahead_m, right_m = (
-        HEIGHT_M * (math.tan(math.radians(one)) - math.tan(math.radians(other)))
-        for one, other in ((mount.ahead_deg, was.ahead_deg), (mount.right_deg, was.right_deg))
-    )
-    east_m = ahead_m * math.sin(heading) + right_m * math.cos(heading)
-    north_m = ahead_m * math.cos(heading) - right_m * math.sin(heading)
+    now, before = (np.tan(np.radians((each.right_deg, each.ahead_deg))) for each in (mount, was))
+    east_m, north_m = HEIGHT_M * picture_axes(event.vehicle.heading_deg) @ (now - before)
     return move_position(event.located.position, -east_m, -north_m)
 
 

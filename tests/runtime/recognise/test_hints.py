@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fakes import vehicle_at
+from sureness import bare_index
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
-from edgevpr.places.index import PlaceIndex
+from edgevpr.core.types import Candidate, Frame, Place, Position
 from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.locate import Located
 
@@ -22,15 +23,11 @@ def north(metres):
 
 def index_of(north_m, heading_deg):
     """Places so far to the north (NaN: without a position) with these headings."""
-    lat_deg = np.array([north(metres).lat_deg for metres in north_m])
-    return PlaceIndex(
-        place_ids=np.arange(1, len(lat_deg) + 1),
-        lat_deg=lat_deg,
-        lon_deg=np.where(np.isnan(lat_deg), np.nan, 8.0),
-        heading_deg=np.array(heading_deg, np.float16),
-        rows=np.zeros((len(lat_deg), 1)),
-        mean=None,
-    )
+    index = bare_index(len(north_m))
+    index.lat_deg[:] = [north(metres).lat_deg for metres in north_m]
+    index.lon_deg[:] = np.where(np.isnan(north_m), np.nan, 8.0)
+    index.heading_deg[:] = heading_deg
+    return index
 
 
 @pytest.fixture
@@ -38,15 +35,8 @@ def index():
     return index_of([0, 100, 200, 300, np.nan], [0, 10, 20, np.nan, 350])
 
 
-def vehicle(position, t_received_s, has_gps=True):
-    return Vehicle(
-        lat_deg=position.lat_deg,
-        lon_deg=position.lon_deg,
-        alt_m=0.0,
-        heading_deg=None,
-        t_received_s=t_received_s,
-        has_gps=has_gps,
-    )
+def vehicle(position, t_received_s):
+    return vehicle_at(position.lat_deg, position.lon_deg, t_received_s)
 
 
 def found(metres=0.0, heading_deg=None, rotation_deg=None):

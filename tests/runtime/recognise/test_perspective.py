@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from levelled_views import lit_ground, view_from
+from scipy.spatial.transform import Rotation
 
 from edgevpr.core.contract import Perspective
 from edgevpr.frames.level import View
@@ -25,11 +26,8 @@ def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, 
     rng = np.random.default_rng(3)
     right, down = rng.uniform(-0.5, 0.5, count), rng.uniform(-0.37, 0.37, count)
     # Rays through the picture, in the axes nose, right, down of the aircraft, turned to those of a level one.
-    rays = np.stack([-(down + nadir_offset[1]), right - nadir_offset[0], np.full(count, FOCAL)])
-    roll, pitch = map(math.radians, (roll_deg, pitch_deg))
-    about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
-    about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
-    nose, to_right, below = np.array(about_right) @ np.array(about_nose) @ rays
+    rays = np.column_stack([-(down + nadir_offset[1]), right - nadir_offset[0], np.full(count, FOCAL)])
+    nose, to_right, below = Rotation.from_euler("YX", (pitch_deg, roll_deg), degrees=True).apply(rays).T
     ground = FOCAL * (to_right - 1j * nose) / below
     known = scale * np.exp(1j * math.radians(turned_deg)) * ground + complex(0.05, -0.03)
     return right + 1j * down, known + noise * (rng.normal(size=count) + 1j * rng.normal(size=count))
@@ -41,11 +39,9 @@ def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg,
     """Right wing down, the middle of the picture is to the left: the aircraft is right of it."""
     asked, known = landmarks(roll_deg=roll_deg, pitch_deg=pitch_deg, turned_deg=turned_deg, scale=scale)
     lean = fit_attitude_error(asked, known, SEEN, up_deg=turned_deg)
-    along = np.array([math.tan(math.radians(roll_deg)), -math.tan(math.radians(pitch_deg))])  # right, ahead
-    turned = math.radians(turned_deg)
-    east = along[0] * math.cos(turned) + along[1] * math.sin(turned)
-    north = along[1] * math.cos(turned) - along[0] * math.sin(turned)
-    assert lean.nadir_shift == pytest.approx((east, north), abs=0.004)
+    along = math.tan(math.radians(roll_deg)) - 1j * math.tan(math.radians(pitch_deg))  # right, ahead
+    east_north = along * np.exp(-1j * math.radians(turned_deg))
+    assert complex(*lean.nadir_shift) == pytest.approx(east_north, abs=0.004)
     assert lean.sd == pytest.approx(math.tan(math.radians(0.5)), rel=0.2)  # of the place's picture
 
 
@@ -107,12 +103,8 @@ def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_d
     lean = fit_attitude_error(*found.inlier_points, query.view, found.rotation_deg)
     # The left wing is up: the camera looks to the left, and the aircraft is right of where it is taken to be.
     right, ahead = (math.tan(math.radians(each)) for each in (roll_deg - told_roll_deg, -pitch_deg))
-    turned = math.radians(40.0)
-    east, north = (
-        right * math.cos(turned) + ahead * math.sin(turned),
-        ahead * math.cos(turned) - right * math.sin(turned),
-    )
-    assert lean.nadir_shift == pytest.approx((east, north), abs=max(0.012, 2 * lean.sd))
+    east_north = complex(right, ahead) * np.exp(-1j * math.radians(pose.heading_deg))
+    assert complex(*lean.nadir_shift) == pytest.approx(east_north, abs=max(0.012, 2 * lean.sd))
     assert lean.sd < 0.03
 
 

@@ -3,12 +3,11 @@
 import json
 import shutil
 import signal
-import time
 
 import pytest
 import yaml
 from commands import refused
-from flight_process import simulated_autopilot, start, wait_for
+from flight_process import ended, simulated_autopilot, start, wait_for
 from flights import PLACES, of_kind
 from mavlink_peers import Peer, UdpPort
 
@@ -16,7 +15,6 @@ from edgevpr.cli.main import main
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.review.compare import compare_lines
 from edgevpr.review.replay import replay
-from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import TAPE, recordings
 
 pytestmark = pytest.mark.slow
@@ -34,11 +32,6 @@ def fly(recording, tmp_path):
         return start(place_map, pictures, tmp_path / "flight.jsonl", "--record", str(tmp_path / "recorded"), *flags)
 
     return started
-
-
-def ended(process):
-    said = process.communicate(timeout=120)[1]
-    assert process.returncode in (0, -signal.SIGKILL), said
 
 
 def is_the_same(log, **how):
@@ -77,9 +70,7 @@ def test_a_flight_goes_on_when_its_terminal_closes_and_a_signal_that_ends_it_is_
         flight = fly("--link", link, "--rate-hz", "5")
         wait_for("query", log, flight)
         flight.send_signal(signal.SIGHUP)
-        while len(of_kind(read_log(log), "query")) < 5:
-            assert flight.poll() is None
-            time.sleep(0.02)
+        wait_for("query", log, flight, count=5)
         flight.send_signal(signal.SIGTERM)
         ended(flight)
     again, _ = is_the_same(log)
@@ -103,11 +94,9 @@ def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_pa
     log = tmp_path / "flight.jsonl"
     with simulated_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "10")
-        while len(of_kind(read_log(log), "query") if log.exists() else ()) < 12:
-            assert flight.poll() is None
-            time.sleep(0.02)
+        wait_for("query", log, flight, count=12)
         flight.kill()
-        ended(flight)
+        ended(flight, -signal.SIGKILL)
     again, _ = is_the_same(log)
     assert again.why_ended
     assert len(of_kind(again.lines, "query")) >= 2, "what is half a second old is on the disk"

@@ -2,13 +2,11 @@
 
 import os
 import signal
-import socket
 import time
-from contextlib import contextmanager
 
 import psutil
 import pytest
-from flight_process import cpu_s, simulated_autopilot, start, wait_for
+from flight_process import cpu_s, ended, manager, simulated_autopilot, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
 
 from edgevpr.cli.main import main
@@ -28,19 +26,11 @@ def fly(recording, tmp_path):
     return started
 
 
-def wait_for_queries(log, count, process):
-    wait_for("start", log, process)
-    while len(of_kind(read_log(log), "query")) < count:
-        assert process.poll() is None, process.communicate()[1]
-        time.sleep(0.02)
-
-
 def test_run_sends_what_the_log_says(fly, tmp_path):
     with simulated_autopilot() as (link, asked):
         run = fly("--link", link, "--rate-hz", "3")  # ten seconds: a vehicle must have been heard before the first fix
-        said = run.communicate(timeout=120)[1]
+        said = ended(run)
         seen = asked()
-    assert run.returncode == 0, said
     lines = list(read_log(tmp_path / "flight.jsonl"))
     queries, end = of_kind(lines, "query"), lines[-1]
     assert [line["kind"] for line in (lines[0], end)] == ["start", "end"]
@@ -73,7 +63,7 @@ WITHHELD = {"DRY_RUN", "NO_TELEMETRY"}  # the second for five seconds
 
 def test_dry_run_sends_all_but_fixes(fly, tmp_path):
     with simulated_autopilot() as (link, asked):
-        said = fly("--link", link, "--rate-hz", "20", "--dry-run").communicate(timeout=120)[1]
+        said = ended(fly("--link", link, "--rate-hz", "20", "--dry-run"))
         seen = asked()
     assert "COMMAND_INT" not in seen.messages
     for name in ("HEARTBEAT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT", "ONBOARD_COMPUTER_STATUS"):
@@ -92,7 +82,7 @@ def test_dry_run_sends_all_but_fixes(fly, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_run_ends_by_a_signal_with_a_complete_log(fly, tmp_path, number):
     run = fly("--rate-hz", "0.5", "--link", "udpout:127.0.0.1:9")
-    wait_for_queries(tmp_path / "flight.jsonl", 1, run)
+    wait_for("query", tmp_path / "flight.jsonl", run)
     run.send_signal(number)
     assert run.wait(timeout=60) == 0
     run.stderr.close()
@@ -133,20 +123,9 @@ def test_run_breaks_off_a_long_query(recording, tmp_path):
             assert run.poll() is None
             time.sleep(0.02)
         run.terminate()
-        said = run.communicate(timeout=60)[1]
-    assert run.returncode == 0, said
+        ended(run)
     lines = list(read_log(log))
     assert [line["kind"] for line in lines] == ["start", "end"], "what is broken off is no query"
-
-
-@contextmanager
-def manager(tmp_path):
-    """systemd's end of the socket, and the environment that names it."""
-    address = str(tmp_path / "notify")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
-        listening.bind(address)
-        listening.settimeout(60)
-        yield listening, {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"}
 
 
 def test_run_notifies_systemd(fly, tmp_path):
@@ -164,21 +143,17 @@ def test_run_notifies_systemd(fly, tmp_path):
 def test_run_puts_a_relative_log_into_the_folder_of_logs(fly, tmp_path):
     (tmp_path / "logs").mkdir()
     run = fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs"))
-    said = run.communicate(timeout=120)[1]
-    assert run.returncode == 0, said
+    ended(run)
     assert list(read_log(tmp_path / "logs" / "own.jsonl"))[-1]["kind"] == "end"
 
 
 def test_service_flies_where_no_status_can_be_written_and_opens_no_port(fly, tmp_path):
     config, status = tmp_path / "c.yaml", tmp_path / "nowhere" / "s"
     config.write_text(f"status: {{file: {status}}}\n")
-    refused = fly("--config", config)
-    assert str(status) in refused.communicate(timeout=120)[1]
-    assert refused.returncode == 1
+    assert str(status) in ended(fly("--config", config), code=1)
     log = tmp_path / "2.jsonl"
     service = fly("--config", config, "--rate-hz", "2", log=log, NOTIFY_SOCKET=str(tmp_path / "nobody"))
-    wait_for_queries(log, 1, service)
+    wait_for("query", log, service)
     assert {each.status for each in psutil.Process(service.pid).net_connections("inet")} <= {psutil.CONN_NONE}
     service.terminate()
-    service.communicate(timeout=60)
-    assert service.returncode == 0
+    ended(service)

@@ -2,7 +2,6 @@
 said of it, that SIGTERM ends them, and what systemd's watchdog hears."""
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from flight_process import start
+from flight_process import manager, start
 from flights import of_kind
 from loopback import PATIENCE_S, wait_until
 
@@ -65,13 +64,12 @@ def test_run_reports_a_hanging_camera_and_ends(hanging, step, state, tmp_path):
 
 
 def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(hanging, tmp_path):
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        flight = hanging("main", NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="200000")
-        manager.settimeout(2.0)
+    with manager(tmp_path) as (listening, environment):
+        flight = hanging("main", **environment)
+        listening.settimeout(2.0)
         give_up_s = time.monotonic() + PATIENCE_S
         with suppress(TimeoutError):
-            while manager.recv(4096):
+            while listening.recv(4096):
                 assert time.monotonic() < give_up_s, "it is still fed"
     flight.terminate()
     assert flight.wait(END_S) == 1
