@@ -60,3 +60,18 @@ def models(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
     return folder
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Write files below a root, such as a machine's /proc and /sys: tree({"proc/meminfo": "..."}) -> the root. Further
+    calls change and add files."""
+
+    def write(files):
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return tmp_path
+
+    return write

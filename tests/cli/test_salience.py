@@ -8,10 +8,6 @@ from commands import refused, run_json
 
 pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "runtime/recognise"))
 from tiny_detectors import write_detector, write_memorability
 
 from edgevpr.cli.main import main
@@ -20,12 +16,10 @@ from edgevpr.places.mapfile import PlaceMap
 
 
 @pytest.fixture
-def networks(tmp_path, monkeypatch):
-    folder = tmp_path / "networks"
-    monkeypatch.setenv("EDGEVPR_MODELS", str(folder))
-    write_memorability(folder)
-    write_detector(folder, [(0, 0, 32, 64, 2)])
-    return folder
+def networks(models):
+    write_memorability(models)
+    write_detector(models, [(0, 0, 32, 64, 2)])
+    return models
 
 
 def texture(seed, spread=40.0):

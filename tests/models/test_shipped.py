@@ -11,12 +11,9 @@ from edgevpr.core.files import find_shipped
 from edgevpr.runtime.recognise.gate_networks import Memorability
 from edgevpr.techniques.card import load_card
 
+pytestmark = pytest.mark.usefixtures("models")
+
 MODELS = find_shipped("models")
-
-
-@pytest.fixture(autouse=True)
-def shipped_alone(tmp_path, monkeypatch):
-    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
 
 
 def test_card_is_of_its_file():

@@ -32,13 +32,12 @@ def test_what_cannot_be_is_said_before_take_off(name, settings, error, says):
         create(name, settings)
 
 
-def test_a_picture_without_any_region_says_nothing(tmp_path, monkeypatch):
-    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
-    write_network(tmp_path, "dim", fault="below zero in the dark", card={"input": {**CARD["input"], "mean": [0.0]}})
+def test_a_picture_without_any_region_says_nothing(models):
+    write_network(models, "dim", fault="below zero in the dark", card={"input": {**CARD["input"], "mean": [0.0]}})
     sha256 = open_backbone("dim", "features").sha256
     for kind, count in (("regions", 12), ("bow", 40)):
         words = np.random.default_rng(0).random((count, 4)).astype(np.float16)
-        np.savez(tmp_path / f"dim_{kind}{count}.npz", words=words, model_sha256=sha256)
+        np.savez(models / f"dim_{kind}{count}.npz", words=words, model_sha256=sha256)
     for name, count in (("region_vlad", 12), ("cross_region_bow", 40)):
         it = create(name, {"model": "dim", "words": count})
         night, day = it.encode(np.zeros((32, 32), np.uint8)), it.encode(textured(1))

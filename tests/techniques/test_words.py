@@ -10,10 +10,9 @@ from edgevpr.techniques import words
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    write_card(tmp_path / "tiny.yaml", {"sha256": "0" * 64})
-    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
-    return tmp_path
+def folder(models):
+    write_card(models / "tiny.yaml", {"sha256": "0" * 64})
+    return models
 
 
 def write(folder, kind="vlad", count=3, **changes):

@@ -54,18 +54,16 @@ def test_take_reports_nothing_of_a_value_that_is_unknown(watch):
     assert [severity for _, severity, _ in watch([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
 
 
-def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_flight, clock, link, tmp_path, caplog):
-    firmware = tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled"
-    firmware.parent.mkdir(parents=True)
-    firmware.write_text("0\n")
+def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_flight, clock, link, tree, caplog):
+    root = tree({(firmware := "sys/devices/platform/soc/soc:firmware/get_throttled"): "0\n"})
     flight, statuses = make_flight("hog"), []
 
     class Status:
         def write(self, status):
             statuses.append(status)
-            firmware.write_text({1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n"))
+            tree({firmware: {1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n")})
 
-    meter = flight_meter(flight, machine=Machine(flight.board, ThermalWatch(tmp_path)))
+    meter = flight_meter(flight, machine=Machine(flight.board, ThermalWatch(root)))
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * 45, clock), meter, status=Status())
     notes = [(line["note"]["code"], line["why"]) for line in of_kind(lines, "companion")]
     begun = str(Reason(ReasonCode.UNDER_VOLTAGE))

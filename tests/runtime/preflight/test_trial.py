@@ -9,11 +9,6 @@ from edgevpr.runtime.preflight import trial
 from edgevpr.runtime.preflight.trial import list_trials, run_trials
 
 
-@pytest.fixture(autouse=True)
-def no_models(monkeypatch, tmp_path):
-    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path / "models"))
-
-
 def die_of_hog(trials, threads):
     if trials[0].name == "hog":
         os.kill(os.getpid(), signal.SIGKILL)
@@ -21,6 +16,7 @@ def die_of_hog(trials, threads):
 
 
 @pytest.mark.process
+@pytest.mark.usefixtures("models")
 def test_try_each_reports_a_process_that_dies_and_goes_on(monkeypatch):
     monkeypatch.setattr(trial, "_run_in_child", die_of_hog)
     found = list(run_trials([*list_trials(["hog"]), *list_trials(["seqslam"])], threads=1))

@@ -18,11 +18,9 @@ PICTURE = np.full((128, 256), 90, np.uint8)
 
 
 @pytest.fixture
-def opened(tmp_path, monkeypatch):
-    monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
-
+def opened(models):
     def open_it(*args, **kwargs):
-        write_detector(tmp_path, *args, **kwargs)
+        write_detector(models, *args, **kwargs)
         return Detector(load_card("tiny"))
 
     return open_it

@@ -16,21 +16,19 @@ from edgevpr.runtime.service.findingcodes import FindingCode
 
 
 @pytest.fixture
-def root(tmp_path) -> Path:
+def root(tree) -> Path:
     """The root of a machine with cgroup v2, 512 MB and a serial port."""
-    for name, text in {
+    files = {
         "proc/meminfo": "MemTotal: 500000 kB\n",
         "proc/self/cgroup": "0::/user.slice\n",
         "proc/cmdline": "root=/dev/sda1",
         "sys/fs/cgroup/cgroup.controllers": "cpu memory",
         "sys/fs/cgroup/user.slice/memory.max": "300000000\n",
-    }.items():
-        path = tmp_path / "root" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    (tmp_path / "root" / "dev").mkdir()
-    (tmp_path / "root" / "dev/ttyAMA0").symlink_to("/dev/null")
-    return tmp_path / "root"
+    }
+    root = tree({f"root/{name}": text for name, text in files.items()}) / "root"
+    (root / "dev").mkdir()
+    (root / "dev/ttyAMA0").symlink_to("/dev/null")
+    return root
 
 
 def find(root: Path, link: str = "udpin:127.0.0.1:14550") -> dict:
