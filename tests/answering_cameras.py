@@ -14,7 +14,7 @@ WIDTH = 320
 HEIGHT = 240
 RATE_HZ = 10
 _NOISE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-_RTCP = 200  # second byte of a packet that is no part of a picture
+RTCP = 200  # second byte of a packet that is no part of a picture
 _SDP = describe_rtp("libx264", 0) + "a=control:track0\r\n"
 
 
@@ -145,7 +145,7 @@ class RtspCamera(Server):
     def send(self, packet):
         for viewer in self._viewers:
             with suppress(OSError):  # it has gone
-                viewer.sendall(bytes((0x24, packet[1] == _RTCP)) + len(packet).to_bytes(2, "big") + packet)
+                viewer.sendall(bytes((0x24, packet[1] == RTCP)) + len(packet).to_bytes(2, "big") + packet)
 
     def close(self):
         super().close()

@@ -1,5 +1,7 @@
-"""Headless Chromium, where it is installed."""
+"""Headless Chromium, where it is installed, and the data of pages."""
 
+import json
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +11,11 @@ from typing import Any
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+
+
+def data_of(content: str) -> Any:
+    """The data of a page for its script."""
+    return json.loads(re.search(r'id="page">(.*?)</script>', content)[1])
 
 
 @contextmanager

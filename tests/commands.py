@@ -1,5 +1,6 @@
 """The commands, run in this process."""
 
+import argparse
 import json
 
 from edgevpr.cli.main import main
@@ -28,3 +29,13 @@ def refused(capsys, *argv, code=2, is_alone=False) -> str:
     assert not is_alone or said == f"{sentence}\n"
     assert "Traceback" not in said
     return sentence
+
+
+def leaves(parser):
+    """The names of all commands, and their parsers."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                yield from leaves(each)
+            return
+    yield parser.prog.partition(" ")[2], parser

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from answering_cameras import RtspCamera
+from answering_cameras import RTCP, RtspCamera
 from encoders import Encoder, describe_rtp
 from loopback import free_port
 from numbered_pictures import HEIGHT, WIDTH, numbers_in, picture
@@ -34,7 +34,6 @@ _ENCODERS = {  # by FFmpeg's names of codecs and of their options
     "MJPEG": ("mjpeg", {"huffman": "default", "threads": "1", "qmin": "4", "qmax": "4"}),
 }
 _TS_BYTES = 7 * 188  # of a datagram of MPEG-TS
-_RTCP = 200  # second byte of a packet that is no part of a picture
 _MJPEG = ("whole", "cut to 15 %", "bytes corrupted", "truncated")
 _LOSSY = (
     ("H.264", "MPEG-TS", (0.0, 0.1, 0.3, 0.5)),
@@ -84,12 +83,10 @@ class Camera:
         self.sent_s: dict[int, float] = {}
         self.done = threading.Event()
         self._film, self._rolls = film, threading.Event()
-        self._threads: list[threading.Thread] = []
+        self._thread = threading.Thread(target=self._send, daemon=True)
 
-    def _start(self, *works: Callable[[], None]) -> None:
-        self._threads = [threading.Thread(target=work, daemon=True) for work in works]
-        for thread in self._threads:
-            thread.start()
+    def _send(self) -> None:
+        raise NotImplementedError
 
     def roll(self) -> None:
         self._rolls.set()
@@ -97,8 +94,7 @@ class Camera:
     def close(self) -> None:
         """Wait until all is sent, and release the sockets."""
         self._rolls.set()
-        for thread in self._threads:
-            thread.join()
+        self._thread.join()
 
 
 class MjpegCamera(Camera):
@@ -110,9 +106,9 @@ class MjpegCamera(Camera):
         self._server = socket.create_server(("127.0.0.1", 0))
         self._server.settimeout(60)
         self.uri = f"http://127.0.0.1:{self._server.getsockname()[1]}/"
-        self._start(self._serve)
+        self._thread.start()
 
-    def _serve(self) -> None:
+    def _send(self) -> None:
         with self._server, self._server.accept()[0] as viewer:
             viewer.recv(4096)
             viewer.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=part\r\n\r\n")
@@ -150,7 +146,7 @@ class LossyCamera(Camera):
         if transport == "RTSP":
             self._server = RtspCamera(sdp)
             self.uri = self._server.uri
-        self._start(self._send)
+        self._thread.start()
 
     def close(self) -> None:
         super().close()
@@ -172,7 +168,7 @@ class LossyCamera(Camera):
     def _hand_on(self, out: socket.socket, data: bytes) -> None:
         size = _TS_BYTES if self._form == "mpegts" else len(data)
         for datagram in (data[start : start + size] for start in range(0, len(data), size)):
-            is_rtcp = self._form == "rtp" and datagram[1] == _RTCP
+            is_rtcp = self._form == "rtp" and datagram[1] == RTCP
             if is_rtcp or (len(self.sent_s) > _WHOLE_AT_FIRST and self._random.random() < self._lost):
                 continue
             if self._server:

@@ -15,6 +15,7 @@ from pictures import seen_from_above, textured
 import edgevpr
 from edgevpr.cli.main import main
 from edgevpr.core.errors import ImageError, MapError, SourceError, UsageError
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 
 pytestmark = pytest.mark.slow
@@ -64,10 +65,7 @@ def test_map_match_returns_position_and_confidence(flight, valley):
         assert match.place.source_image == "3.jpg"
         assert match.position.lat_deg == pytest.approx(50.006, abs=1e-4)
         assert match.confidence > 0.999
-        assert (
-            abs((match.rotation_deg - 315 + 180) % 360 - 180) <= 15
-            or abs((match.rotation_deg - 45 + 180) % 360 - 180) <= 15
-        )
+        assert min(abs(wrap_deg(match.rotation_deg - turn_deg)) for turn_deg in (45, 315)) <= 15
         assert match.t_query_s > 0
         feature = json.loads(json.dumps(match.geojson()))
         assert feature["geometry"]["coordinates"] == [match.position.lon_deg, match.position.lat_deg]

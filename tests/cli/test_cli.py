@@ -1,6 +1,5 @@
 """The commands as a user types them, and one clear sentence for everything that is wrong."""
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from commands import refused, run, run_json
+from commands import leaves, refused, run, run_json
 from pictures import textured, write_flight
 
 from edgevpr.cli.examples import EXAMPLES
@@ -191,16 +190,6 @@ def test_main_suggests_a_word_for_a_wrong_one(capsys, words, meant):
         main(words)
     assert exit_code.value.code == 2
     assert f"did you mean `{meant}`?" in capsys.readouterr().err
-
-
-def leaves(parser):
-    """The names of all commands, and their parsers."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for each in action.choices.values():
-                yield from leaves(each)
-            return
-    yield parser.prog.partition(" ")[2], parser
 
 
 def test_help_of_every_command_has_examples_that_parse():

@@ -33,9 +33,8 @@ def valley(whole_valley, tmp_path):
     return shutil.copy(whole_valley, tmp_path / whole_valley.name)
 
 
-def built(path, flight, *flags):
-    technique = () if "--append" in flags else ("--technique", "cohog", "--param", "w1=208")
-    return ["map", "build", str(path), "--images", str(flight / "images"), *technique, *flags]
+def built(path, flight):
+    return ["map", "build", str(path), "--images", str(flight / "images"), "--technique", "cohog", "--param", "w1=208"]
 
 
 DAMAGE = (

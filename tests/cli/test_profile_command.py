@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 from commands import refused, run, run_json
-from example_costs import REGIONS, VECTOR
+from example_costs import REGIONS, VECTOR, found
 from pictures import textured, write_flight
 
 from edgevpr import techniques
@@ -37,9 +37,8 @@ def tried(monkeypatch):
 
     monkeypatch.setattr(trial, "run_trials", answer)
     monkeypatch.setattr(techniques, "list_techniques", lambda: ("cohog", "hog", "seqslam", "calc"))
-    counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
-    table = {label: {"recall_at_1": recall, **counts} for label, recall in recalls.items()}
+    table = {label: found(recall) for label, recall in recalls.items()}
     monkeypatch.setattr(choose, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return asked
 

@@ -9,23 +9,19 @@ import pytest
 from answering_cameras import Server
 from encoders import Encoder
 from loopback import wait_until
+from numbered_pictures import HEIGHT, WIDTH, picture
 
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-SIZE_PX = 160, 120
 RATE_HZ = 20
-
-
-def picture(number):
-    return np.random.default_rng(number).integers(0, 255, (*SIZE_PX[::-1], 3), np.uint8)
 
 
 def transport_stream(connection, codec="mpeg2video", **options):
     """An encoder of MPEG-TS for a viewer."""
-    return Encoder(connection.sendall, "mpegts", codec, RATE_HZ, SIZE_PX, {"g": "5", **options})
+    return Encoder(connection.sendall, "mpegts", codec, RATE_HZ, (WIDTH, HEIGHT), {"g": "5", **options})
 
 
 def pictures_then_sound(connection):

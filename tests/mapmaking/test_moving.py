@@ -49,9 +49,9 @@ def log_of(path, *lines):
     return log
 
 
-def places_of(path):
+def places_of(path, numbers=None):
     with PlaceMap.open(path) as place_map:
-        return list(place_map.read_places())
+        return list(place_map.read_places(numbers))
 
 
 def test_every_position_is_moved_by_what_the_flight_found_last(path, capsys):
@@ -97,12 +97,7 @@ def test_a_log_that_does_not_say_where_the_map_lies_moves_nothing(path, lines, c
 def test_a_damaged_place_stops_the_whole_move(path):
     with PlaceMap.open_for_writing(path) as place_map, place_map.transaction():
         place_map.db.execute("UPDATE places SET heading_deg = 'north' WHERE place_id = 2")
-    log, before = log_of(path, FOUND), places_of_first(path)
+    log, before = log_of(path, FOUND), places_of(path, [1])
     with PlaceMap.open_for_writing(path) as place_map, pytest.raises(PlaceError):
         move_map(place_map, log)
-    assert places_of_first(path) == before
-
-
-def places_of_first(path):
-    with PlaceMap.open(path) as place_map:
-        return next(place_map.read_places([1]))
+    assert places_of(path, [1]) == before

@@ -16,7 +16,7 @@ from map_writer import write_sql
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, move_position, offset_position
 from edgevpr.core.text import iterate_silently
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.simulate.camera import Camera, light_scene, photograph
@@ -210,8 +210,6 @@ def test_refine_ties_pictures_by_votes_where_landmarks_are_missing(tmp_path):
 
 
 def test_refine_leaves_places_of_a_surveyed_picture(built, tmp_path):
-    from edgevpr.core.types import Pose
-
     with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
         lies = Pose(up_deg=0.0, footprint_m=80.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
         (first, *_) = there.read_places([1])

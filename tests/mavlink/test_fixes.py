@@ -4,7 +4,7 @@ import logging
 import math
 
 import pytest
-from conversing import FIX_3D
+from conversing import ARMED, FIX_3D
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, FixTransmission
@@ -19,7 +19,6 @@ LATE = FixAnswer(None, Reason(ReasonCode.NO_ANSWER, {"limit_s": 1.0}), None)
 UNANSWERED = Reason(ReasonCode.FIXES_UNANSWERED)
 GPS_IN_USE = Reason(ReasonCode.GPS_IN_USE)
 SILENT = Reason(ReasonCode.NO_COMMAND_ANSWERED)
-ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
 @pytest.fixture

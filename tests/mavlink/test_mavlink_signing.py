@@ -33,6 +33,7 @@ KEY = bytes(range(32))
 OTHER_KEY = bytes(32)
 NOW = 1_000_000 * TICKS_S  # the time stamp that the clocks of these tests begin with
 UTC_S = 1_420_070_400 + NOW / TICKS_S
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
 
 
 @pytest.fixture
@@ -50,10 +51,9 @@ class Signer:
         self.packer.signing.secret_key, self.packer.signing.link_id = key, link_id
         self.packer.signing.timestamp = stamp
 
-    def packet(self, stamp: int | None = None, message=None) -> bytes:
+    def packet(self, stamp: int | None = None, message=HEARTBEAT) -> bytes:
         if stamp is not None:
             self.packer.signing.timestamp = stamp
-        message = message or mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
         return message.pack(self.packer)
 
 
@@ -62,8 +62,7 @@ def admitted(signing: Signing, *packets: bytes) -> list[bool]:
     return [bool(list(receiver.feed(packet))) for packet in packets]
 
 
-def unsigned(message=None) -> bytes:
-    message = message or mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
+def unsigned(message=HEARTBEAT) -> bytes:
     return message.pack(mavlink.MAVLink(None, 7, 1))
 
 
@@ -92,9 +91,7 @@ def test_a_message_that_was_changed_anywhere_is_refused(signing, place):
 
 
 def test_unsigned_messages_are_refused_counted_and_told_once(signing, caplog):
-    old_protocol = mavlink.MAVLink_heartbeat_message(2, 3, 1, 0, 4, 3).pack(
-        mavlink.MAVLink(None, 7, 1), force_mavlink1=True
-    )
+    old_protocol = HEARTBEAT.pack(mavlink.MAVLink(None, 7, 1), force_mavlink1=True)
     assert not any(admitted(signing, unsigned(), unsigned(), old_protocol))
     assert signing.refused == {UNSIGNED: 3}
     assert caplog.text.count("does not sign") == 1

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from conversing import ABS
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Vehicle
@@ -10,13 +11,11 @@ from edgevpr.mavlink.receivers import DEFAULT_GPS_SD_M
 from edgevpr.mavlink.vehicle import DRIFT_M_S
 from edgevpr.mavlink.wire import mavlink
 
-ABS = mavlink.EKF_POS_HORIZ_ABS
 REL = mavlink.EKF_POS_HORIZ_REL
 CONST_POS = mavlink.EKF_CONST_POS_MODE
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 FAILED = mavlink.MAV_RESULT_FAILED
 FIX_2D = mavlink.GPS_FIX_TYPE_2D_FIX
-FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
 def test_its_position_is_known_while_it_is_fresh(autopilot):

@@ -1,15 +1,13 @@
 """A flight over a map, by the real recogniser, loop and log, for the tests of what is made of it afterwards."""
 
-from dataclasses import replace
-
 import pytest
 from browser import driven
 from commands import run
-from fakes import FakeClock, FakeLink, FakeSource, receiver_at
+from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
 from flights import Flight
 from pictures import textured, write_flight
 
-from edgevpr.core.types import Frame, Vehicle
+from edgevpr.core.types import Frame
 from edgevpr.runtime.flight.startup import start_fields
 
 PLACES = 8  # the last pictures are of nothing in the map
@@ -29,12 +27,11 @@ def flown(tmp_path_factory):
     assert run("map", "build", folder / "map.gpkg", "--images", folder / "ref", *flags) == 0
 
     clock = FakeClock()
-    aircraft = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=100.0, heading_deg=0.0, t_received_s=0.0, has_gps=False)
 
-    def vehicle() -> Vehicle:
+    def vehicle():
         lat_deg = 50 + STEP_DEG * (clock() - 1000)
         receiver = receiver_at((lat_deg, 8.00126), 1.0, clock())
-        return replace(aircraft, lat_deg=lat_deg, t_received_s=clock(), gps=receiver)
+        return vehicle_at(lat_deg, 8.0, clock(), heading_deg=0.0, has_gps=False, gps=receiver)
 
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(folder / "map.gpkg", folder / "flight.jsonl", clock, link, **{"source.rate_hz": 1.0})

@@ -32,9 +32,8 @@ def position(east_m: float, north_m: float) -> tuple[float, float]:
     return offset_position(*ORIGIN, east_m, north_m)
 
 
-def places_in(folder: Path, rotation_deg: float = 0.0) -> list[Place]:
-    """Cut a picture for each place of a grid, each turned otherwise, and write it into a folder. The poses say
-    `rotation_deg` more."""
+def places_in(folder: Path) -> list[Place]:
+    """Cut a picture for each place of a grid, each turned otherwise, and write it into a folder."""
     ground, places = landscape(), []
     for at in range(ROWS * COLUMNS):
         middle_m = np.array([at % COLUMNS - (COLUMNS - 1) / 2, at // COLUMNS - (ROWS - 1) / 2]) * STEP_M
@@ -46,7 +45,7 @@ def places_in(folder: Path, rotation_deg: float = 0.0) -> list[Place]:
         way = cv2.getAffineTransform(seen, np.float32([[0, 0], [width, 0], [width, height]]))
         name = f"{at:02d}.png"
         cv2.imwrite(str(folder / name), cv2.warpAffine(ground, way, (width, height)))
-        pose = Pose(up_deg=(up_deg + rotation_deg) % 360, footprint_m=SIDE_M, covariance_m2=(1.0, 0.0, 1.0))
+        pose = Pose(up_deg=up_deg % 360, footprint_m=SIDE_M, covariance_m2=(1.0, 0.0, 1.0))
         at_deg = Position(*position(*middle_m.tolist()))
         places.append(Place(place_id=at + 1, source_image=name, position=at_deg, pose=pose))
     return places

@@ -1,12 +1,10 @@
 """The page of a map."""
 
-import json
-import re
 from dataclasses import replace
 from shutil import copyfile
 
 import pytest
-from browser import opened
+from browser import data_of, opened
 from commands import refused
 from ground import STEP_M, places_in, position
 
@@ -47,7 +45,7 @@ def test_map_page_shows_places_and_their_problems(browser, mapped):
     out = mapped / "map.html"
     argv = ["map", "info", mapped / "valley.gpkg", "--page", out, "--map-images", mapped / "ref"]
     assert main(list(map(str, argv))) == 0
-    data = json.loads(re.search(r'id="page">(.*?)</script>', out.read_text("utf-8"))[1])
+    data = data_of(out.read_text("utf-8"))
     alike = {step["title"]: step["texts"][-1] for step in data["steps"] if "looks like" in step["texts"][-1]}
     assert "looks like place 13: " in alike["Place 6: 05.png"]
     assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]

@@ -1,12 +1,11 @@
 """The page of a flight: what it says, and that it needs nothing else."""
 
 import base64
-import json
-import re
 
 import cv2
 import numpy as np
 import pytest
+from browser import data_of
 from commands import refused, run
 from logs import query, write_log
 
@@ -19,11 +18,6 @@ NASTY = "<script>alert(1)</script>\"'><img src=http://example.test/x.png>\x1b\u2
 
 def page(path):
     return make_flight_page(read_flight(path), [], Album(), Album())
-
-
-def data_of(content):
-    """The data of a page for its script."""
-    return json.loads(re.search(r'id="page">(.*?)</script>', content)[1])
 
 
 @pytest.fixture(scope="module")

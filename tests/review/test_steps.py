@@ -1,10 +1,7 @@
 """The page as its reader moves it, in a real browser: slider, ground, filter."""
 
-import json
-import re
-
 import pytest
-from browser import opened
+from browser import data_of, opened
 from ground import flown_over, places_in
 from logs import query, write_log
 
@@ -41,7 +38,7 @@ def page(browser, made):
 
 
 def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
-    steps = json.loads(re.search(r'id="page">(.*?)</script>', made.read_text("utf-8"))[1])["steps"]
+    steps = data_of(made.read_text("utf-8"))["steps"]
     page.focus("#step")
     seen = set()
     for at in range(3):

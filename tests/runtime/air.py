@@ -23,13 +23,13 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 HOME = 47.0, 8.0
 GPS_SD_M = 1.0
-_STEP_S = 0.02
+STEP_S = 0.02
 _REPORT_STEPS = 10  # five reports and ten states a second
 _STATE_STEPS = 5
 _FARTHEST_STEPS = 250  # between two frames that share ground
 _GRAVITY_M_S2 = 9.80665
 _DRIFT_M_S = 5.0  # as edgevpr takes an autopilot's own position to go wrong
-_PICTURE = np.zeros((8, 8), np.uint8)
+PICTURE = np.zeros((8, 8), np.uint8)
 _NO_COST = QueryCost(
     t_encode_s=0, t_match_s=0, u_encode=0, u_match=0, cpu_s=0, rss_mb=0, used_mah=0, marginal_mah=0
 )  # fmt: skip
@@ -41,9 +41,9 @@ def match_at(
     """An accepted match of a frame taken at `t_s`."""
     fix = {"position": position, "covariance_m2": (sd_m**2, 0.0, sd_m**2)}
     return Recognition(
-        frame=Frame(image=_PICTURE, name=f"{t_s:.1f} s", t_mono_s=t_s),
+        frame=Frame(image=PICTURE, name=f"{t_s:.1f} s", t_mono_s=t_s),
         vehicle=vehicle,
-        picture=view and LevelledImage(_PICTURE, None, view),
+        picture=view and LevelledImage(PICTURE, None, view),
         best=Candidate(Place(place_id=places[0] if places else 1, source_image="", position=position), FineMatch(0.5)),
         accepted=True,
         located=Located(**fix, places=tuple(places), attitude_error=lean),
@@ -89,8 +89,8 @@ class Air:
         self.gusts, self.noise_sd_m = gusts, math.hypot(fix_sd_m, other_sd_m)
         self.said_sd_m, self.t_sd_s = said_sd_m or fix_sd_m, t_sd_s
         self.wind, self.map_off, self.bias = map(np.array, (wind, map_off, bias))
-        self.every_steps, self.late_steps = round(every_s / _STEP_S), round(late_s / _STEP_S)
-        self.stride_steps = stride_s and round(stride_s / _STEP_S)
+        self.every_steps, self.late_steps = round(every_s / STEP_S), round(late_s / STEP_S)
+        self.stride_steps = stride_s and round(stride_s / STEP_S)
         self.step, self.at_m, self.gps_off_m, self.has_gps = 0, np.zeros(2), np.zeros(2), True
         self.has_receiver = True
         self.off_m = np.zeros(2)  # by how much the autopilot is wrong
@@ -106,7 +106,7 @@ class Air:
 
     @property
     def t_s(self) -> float:
-        return self.step * _STEP_S
+        return self.step * STEP_S
 
     @property
     def sent(self):
@@ -124,20 +124,20 @@ class Air:
 
     def off(self, lat_deg: float, lon_deg: float, t_s: float | None = None) -> np.ndarray:
         """Metres (2,) of a position from where the aircraft was."""
-        true_m = self.at_m if t_s is None else self.way[round(t_s / _STEP_S)]
+        true_m = self.at_m if t_s is None else self.way[round(t_s / STEP_S)]
         return np.array(offset_m(*HOME, lat_deg, lon_deg)) - true_m
 
     def fly(self, seconds: float) -> "Air":
-        for _ in range(round(seconds / _STEP_S)):
+        for _ in range(round(seconds / STEP_S)):
             self.step += 1
-            before, velocity = self.velocity(self.t_s - _STEP_S), self.velocity(self.t_s)
+            before, velocity = self.velocity(self.t_s - STEP_S), self.velocity(self.t_s)
             if not self.has_gps:
-                self.wind = self.wind + self.rng.normal(0, self.gusts * math.sqrt(_STEP_S), 2)
-            self.at_m = self.at_m + _STEP_S * (before + velocity) / 2
+                self.wind = self.wind + self.rng.normal(0, self.gusts * math.sqrt(STEP_S), 2)
+            self.at_m = self.at_m + STEP_S * (before + velocity) / 2
             self.way.append(self.at_m)
-            self.off_m = self.gps_off_m if self.has_gps else self.off_m - _STEP_S * self.wind
+            self.off_m = self.gps_off_m if self.has_gps else self.off_m - STEP_S * self.wind
             if not self.is_silent:
-                self._feel((velocity - before) / _STEP_S)
+                self._feel((velocity - before) / STEP_S)
                 if self.step % _REPORT_STEPS == 0:
                     self._report(velocity)
             if self.step % _STATE_STEPS == 0:
@@ -162,7 +162,7 @@ class Air:
             self._see(step, vehicle)
 
     def _see(self, step, vehicle, is_query=True) -> None:
-        frame = Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S)
+        frame = Frame(image=PICTURE, name="", t_mono_s=step * STEP_S)
         event = Recognition(frame=frame, vehicle=vehicle, odometry=self._stride(step))
         self.navigator.handle_frame(event, is_query)
 
@@ -173,7 +173,7 @@ class Air:
         east_m, north_m = (self.way[step] - self.way[before]) * self.stretch
         turned = complex(east_m, north_m) * np.exp(-1j * self.turn)
         moved_m = np.array([turned.real, turned.imag]) + self.rng.normal(0, self.stride_sd_m, 2)
-        from_s, to_s = before * _STEP_S, step * _STEP_S
+        from_s, to_s = before * STEP_S, step * STEP_S
         return OdometryStep(from_s=from_s, to_s=to_s, moved_m=tuple(moved_m), sd_m=self.stride_sd_m, inliers=100)
 
     def tell(self, event: Recognition) -> Advice:
@@ -182,11 +182,11 @@ class Air:
     def match(self, step, vehicle) -> Advice:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
-        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step))
+        event = match_at(where, step * STEP_S, vehicle, self.said_sd_m, self.places(step))
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event = replace(event, frame=frame, odometry=self._stride(step))
         if self.shows_turn:
-            picture = LevelledImage(_PICTURE, None, replace(event.view, up_deg=0.0))
+            picture = LevelledImage(PICTURE, None, replace(event.view, up_deg=0.0))
             located = replace(event.located, heading_deg=-math.degrees(self.turn))
             event = replace(event, picture=picture, located=located)
         self.events.append(event)
@@ -205,7 +205,7 @@ class Air:
 
     def places(self, step: int) -> tuple[int, ...]:
         """The places that a match of that step is of."""
-        return (round(step * _STEP_S),)
+        return (round(step * STEP_S),)
 
     def _feel(self, acceleration_m_s2: np.ndarray) -> None:
         east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)
@@ -213,7 +213,7 @@ class Air:
 
     def _report(self, velocity: np.ndarray) -> None:
         here = offset_position(*HOME, *(self.at_m + self.off_m))
-        measured_m = self.way[max(0, self.step - round(RECEIVER_LAG_S / _STEP_S))]
+        measured_m = self.way[max(0, self.step - round(RECEIVER_LAG_S / STEP_S))]
         there = offset_position(*HOME, *(measured_m + self.gps_off_m))
         wrong = 0.0 if self.has_gps else self.rng.normal(0, self.velocity_sd, 2) - self.wind
         if self.has_gps:

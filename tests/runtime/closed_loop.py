@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from air import match_at
+from air import PICTURE, match_at
 from fakes import FakeClock
 from simulated.controller import STEP_S, FlightController
 from simulated.motion import Hover, displacement_m
@@ -29,7 +29,6 @@ _MATCH_SD_M = 1.0
 _STRIDE_SD_M = 0.2
 _SHOWN_SD = math.tan(math.radians(1.0))
 _VIEW = View(up_deg=0.0, footprint_m=60.0, nadir_offset=(0.0, 0.0))
-_PICTURE = np.zeros((8, 8), np.uint8)
 
 
 class ClosedLoop:
@@ -154,8 +153,8 @@ class ClosedLoop:
             error = AttitudeError((shown.real, shown.imag), _SHOWN_SD) if self.show_tilt else None
             event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
         else:
-            frame = Frame(image=_PICTURE, name="", t_mono_s=t_s)
-            event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(_PICTURE, None, _VIEW))
+            frame = Frame(image=PICTURE, name="", t_mono_s=t_s)
+            event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(PICTURE, None, _VIEW))
         self._waiting.append(replace(event, odometry=self._stride(truth, t_s)))
 
     def _stride(self, truth, t_s):

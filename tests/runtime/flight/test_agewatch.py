@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, Air, match_at
+from air import HOME, PICTURE, STEP_S, Air, match_at
 from fakes import to_autopilot
 
 from edgevpr.core.geodesy import offset_position
@@ -19,8 +19,6 @@ from edgevpr.runtime.flight.navigator import Advice, Navigator
 
 pytestmark = pytest.mark.slow
 
-_STEP_S = 0.02
-_PICTURE = np.zeros((8, 8), np.uint8)
 CIRCLE = {"turn_s": 20.0}
 TIGHT_CIRCLE = {"turn_s": 7.5}
 STRAIGHT = {"turn_s": math.inf}
@@ -47,17 +45,17 @@ class LateAir(Air):
         return self.speed_m_s * np.array([math.sin(t_s / self.turn_s), math.cos(t_s / self.turn_s)])
 
     def match(self, step, vehicle):
-        true_step = max(0, step - round(self.hidden_s / _STEP_S))
+        true_step = max(0, step - round(self.hidden_s / STEP_S))
         age = self.navigator.age
-        claimed = Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S, delay_sd_s=self.delay_sd_s)
+        claimed = Frame(image=PICTURE, name="", t_mono_s=step * STEP_S, delay_sd_s=self.delay_sd_s)
         frame = age.correct(claimed)
         seen_m = self.way[true_step] + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
         event = match_at(where, frame.t_mono_s, vehicle, self.said_sd_m, self.places(true_step))
-        picture = LevelledImage(_PICTURE, None, replace(event.view, up_deg=self.heading_deg(frame.t_mono_s)))
-        heading_deg = self.heading_deg(true_step * _STEP_S) + self.rng.normal(0, 1.0)
+        picture = LevelledImage(PICTURE, None, replace(event.view, up_deg=self.heading_deg(frame.t_mono_s)))
+        heading_deg = self.heading_deg(true_step * STEP_S) + self.rng.normal(0, 1.0)
         event = replace(event, frame=frame, picture=picture, located=replace(event.located, heading_deg=heading_deg))
-        self.off_s, self.t_sd_s = frame.t_mono_s - true_step * _STEP_S, frame.t_sd_s
+        self.off_s, self.t_sd_s = frame.t_mono_s - true_step * STEP_S, frame.t_sd_s
         age.judge(event)
         if age.is_unknown:
             self.refused.append(self.t_s)

@@ -3,8 +3,8 @@
 from types import SimpleNamespace
 
 import pytest
+from fakes import vehicle_at
 
-from edgevpr.core.types import Vehicle
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.heightwatch import HeightWatch
@@ -20,8 +20,7 @@ class Watch:
         for height_m in heights_m:
             self.clock.now_s += every_s
             now_s = self.clock.now_s
-            where = {"lat_deg": 50.0, "lon_deg": 8.0, "alt_m": 600.0, "heading_deg": None}
-            vehicle = Vehicle(**where, t_received_s=now_s - age_s, has_gps=False, height_m=reported_m)
+            vehicle = vehicle_at(50.0, 8.0, now_s - age_s, has_gps=False, height_m=reported_m)
             self.watch.update(
                 SimpleNamespace(
                     frame=SimpleNamespace(t_mono_s=now_s),

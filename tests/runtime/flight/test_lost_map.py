@@ -4,6 +4,7 @@ waits; as soon as the file is whole again it is used again."""
 import os
 import shutil
 import sqlite3
+from functools import partial
 
 import pytest
 from flights import PLACES, fly_acts, nothing, of_kind
@@ -15,24 +16,10 @@ from edgevpr.places.mapfile import PlaceMap
 SAID = [(4, "edgevpr: map cannot be read, see the log"), (6, "edgevpr: map can be read again")]
 
 
-class Locked:
-    """Another program that holds the file for itself alone."""
-
-    def __init__(self, path):
-        self.path, self.db = path, None
-
-    def lock(self):
-        self.db = sqlite3.connect(self.path, isolation_level=None)
-        self.db.execute("BEGIN EXCLUSIVE")
-
-    def unlock(self):
-        self.db.execute("ROLLBACK")
-        self.db.close()
-
-
 @pytest.mark.slow
 def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_map, tmp_path, monkeypatch):
-    other, waits_ms = Locked(place_map), []
+    other, waits_ms = sqlite3.connect(place_map, isolation_level=None), []  # of another program
+    lock = partial(other.execute, "BEGIN EXCLUSIVE")
 
     def look():
         waits_ms.append(maps[-1].db.execute("PRAGMA busy_timeout").fetchone()[0])
@@ -40,7 +27,7 @@ def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_ma
     maps, opened = [], PlaceMap.open
     monkeypatch.setattr(PlaceMap, "open", lambda path: maps.append(opened(path)) or maps[-1])
     queries, lines, flight = fly_acts(
-        place_map, tmp_path / "log", [look, other.lock, *[nothing] * 8, other.unlock, look, look]
+        place_map, tmp_path / "log", [look, lock, *[nothing] * 8, other.close, look, look]
     )
     assert waits_ms == [50, 50, 50], "no query waits for longer, also when the file has been opened anew"
     assert [line["accepted"] for line in queries] == [True, *[False] * 9, True, True, True]

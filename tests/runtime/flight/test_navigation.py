@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, Air, lengths
+from air import HOME, STEP_S, Air, lengths
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import offset_m, offset_position
@@ -16,8 +16,6 @@ from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatc
 from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
-
-STEP_S = 0.02
 
 
 def match_at(position, t_s, fix_sd_m, attitude_error=None, **frame):
