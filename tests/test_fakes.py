@@ -154,6 +154,7 @@ def test_link_announces_texts_and_hands_on_wishes(kind):
     link.announce(Severity.WARNING, "camera lost", "camera")
     wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 1)
     assert wish(UserCommand.PAUSE) == "TEMPORARILY_REJECTED"
+    assert link.take_command() is None
     link.accept_commands()
     assert (wish(UserCommand.RESUME), wish(UserCommand.PAUSE)) == ("ACCEPTED", "ACCEPTED")
     assert link.take_command() == (UserCommand.PAUSE, "255/190")

@@ -14,7 +14,6 @@ from edgevpr.core.types import Position
 from edgevpr.mavlink.ardupilot_parameters import choose_ardupilot_channel
 from edgevpr.mavlink.channel import Channel, VehicleKind
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.px4_parameters import choose_px4_channel
 from edgevpr.mavlink.wire import mavlink
 
 ARDUPILOT = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -28,16 +27,6 @@ def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be()
     assert (needed.code, needed.parameters["change"]) == (ReasonCode.COMMAND_NEEDS_FLOW, "GPS2_TYPE=14")
     first = choose_ardupilot_channel(VehicleKind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
     assert (first.receiver, first.lag_s) == (0, 0.06)
-
-
-def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
-    assert choose_px4_channel(VehicleKind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
-    assert choose_px4_channel(VehicleKind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
-    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 1}).channel is Channel.VISION
-    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 0}).channel is Channel.VISION
-    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 1}).channel is Channel.SENSOR
-    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 15}).channel is Channel.COMMAND, "another system's"
-    assert choose_px4_channel(VehicleKind.PLANE, {}).channel is Channel.COMMAND
 
 
 def interviewed(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):

@@ -34,6 +34,7 @@ def decide(parameters, kind=VehicleKind.COPTER):
         (ODOMETRY | {"EK3_SRC1_POSXY": 6, "GPS1_TYPE": 0}, Channel.ODOMETRY),
         (SENSOR, Channel.SENSOR),
         (VISION, Channel.VISION),
+        (VISION | {"EKF2_AGP0_CTRL": 1}, Channel.SENSOR),
         (PX4 | {"EKF2_AGP0_CTRL": 0}, Channel.COMMAND),
     ],
 )

@@ -61,19 +61,6 @@ def test_a_wish_that_can_be_fulfilled_is_accepted_and_handed_on(autopilot, reque
     assert requests.take() is None
 
 
-def test_a_wish_is_rejected_for_the_time_being_where_nobody_flies(autopilot):
-    assert answered(autopilot, command_long(31010, 1)) == "TEMPORARILY_REJECTED"
-    assert autopilot.conversation.requests.take() is None
-    autopilot.conversation.requests.is_flying = True
-    assert answered(autopilot, command_long(31010, 2)) == "ACCEPTED"
-
-
-def test_of_wishes_that_contradict_each_other_the_newest_is_left(autopilot, requests):
-    for wish in (UserCommand.PAUSE, UserCommand.RESUME, UserCommand.PAUSE):
-        assert answered(autopilot, command_long(31010, wish)) == "ACCEPTED"
-    assert requests.take().command is UserCommand.PAUSE
-
-
 def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
     assert answered(autopilot, command_long(31010, 1)) == "ACCEPTED"
     held = autopilot.put_fix()

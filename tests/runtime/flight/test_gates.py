@@ -227,7 +227,7 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
 def test_frame_claims_an_error_of_the_height_that_pictures_show():
     navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
     navigator.handle_frame(matched())
-    navigator.correct_height(1.2)
+    navigator.correct_height(1.2, 0.1)
     navigator.handle_frame(matched(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
     navigator.correct_height(1.0, 0.3)
     navigator.handle_frame(matched())

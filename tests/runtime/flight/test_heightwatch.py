@@ -8,7 +8,6 @@ from fakes import vehicle_at
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.heightwatch import HeightWatch
-from edgevpr.runtime.flight.measurements import measure_frame
 
 
 class Watch:
@@ -61,15 +60,6 @@ def test_ratio_sd_is_what_the_newest_match_contradicts_the_ratio_by(watch):
     assert (watch.watch.ratio, watch.watch.ratio_sd) == (1.0, pytest.approx(0.71))
     watch.see(*[141] * 4)
     assert (watch.watch.ratio, watch.watch.ratio_sd) == (pytest.approx(1.41), 0.0)
-
-
-def test_measure_frame_claims_what_the_height_may_be_wrong_by():
-    frame = SimpleNamespace(t_mono_s=1.0, t_sd_s=0.03)
-    event = SimpleNamespace(frame=frame, view=View(), odometry=None)
-    ratios = {(1.0, 0.0): 0.0, (1.0, 0.41): 0.41, (1.4, 0.1): 0.4}
-    for (ratio, ratio_sd), claimed in ratios.items():
-        found = measure_frame(event, None, is_level=False, height_ratio=ratio, height_ratio_sd=ratio_sd)
-        assert found.scale_sd == pytest.approx(claimed)
 
 
 def test_heightwatch_bears_a_reported_height_of_zero(watch):
