@@ -145,7 +145,7 @@ def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_pat
 
 def test_what_is_missing_is_said(fly, recording, tmp_path, capsys):
     log = tmp_path / "flight.jsonl"
-    assert "no such" in refused(capsys, "replay", log)
+    assert "There is no flight log" in refused(capsys, "replay", log)
     ended(start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--rate-hz", "60"))
     assert "not recorded" in refused(capsys, "replay", log)
     log.unlink()
