@@ -21,7 +21,7 @@ from edgevpr.mavlink.parameters import (
 )
 
 MAVLINK_GPS = 14  # value of GPSn_TYPE: the receiver is simulated by GPS_INPUT
-ADVISED_RECEIVER = 1  # index of the receiver that users are advised to assign to edgevpr
+ADVISED_RECEIVER = 1  # index of the receiver that we advise users to assign to edgevpr
 RECEIVERS = ("GPS1_TYPE", "GPS2_TYPE")
 DELAYS = ("GPS1_DELAY_MS", "GPS2_DELAY_MS")
 VISION = "VISO_TYPE"
@@ -53,7 +53,7 @@ _SOURCE_VISION = 6
 _SOURCE_GSF = 8
 _SOURCE_BARO = 1
 _SOURCE_COMPASS = 1
-# Fields of ODOMETRY that repeat the autopilot's own estimate: name of the source, its wrong value, and a right one.
+# Fields of ODOMETRY that repeat the autopilot's own estimate: name of the source, its wrong value, and a correct one.
 _OWN_SOURCES = (
     ("POSZ", _SOURCE_VISION, _SOURCE_BARO),
     ("VELZ", _SOURCE_VISION, 0),
@@ -70,7 +70,7 @@ def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> Chann
     """Choose the channel for an ArduPilot: GPS_INPUT or ODOMETRY if its parameters are set for it, else command 43003.
     `parameters`: the values by name, without parameters that the autopilot does not have.
 
-    A plane dead-reckons without GPS for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
+    A plane without GPS dead-reckons for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
     Without GPS and optical flow, a copter lands within seconds and a rover stops, even if they receive single fixes.
     """
     for number in range(len(RECEIVERS)):
@@ -136,7 +136,7 @@ def _check_blend(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]
 
 
 def _check_lanes(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """Yield the change that frees EKF lane n from receiver n (AP_NavEKF3_Measurements.cpp, update_gps_selection)."""
+    """Yield the change that detaches EKF lane n from receiver n (AP_NavEKF3_Measurements.cpp, update_gps_selection)."""
     affinity = parameters.get("EK3_AFFINITY", 0)
     if has_bit(affinity, _AFFINITY_GPS_BIT) and _has_other_receiver(parameters, choice):
         yield f"EK3_AFFINITY={int(affinity) & ~_AFFINITY_GPS_BIT}"
@@ -152,9 +152,9 @@ def _name_sources(quantity: str) -> tuple[str, ...]:
     return tuple(f"EK3_SRC{number}_{quantity}" for number in (1, 2, 3))
 
 
-def _refuse_source(quantity: str, wrong: int, right: int) -> Check:
+def _refuse_source(quantity: str, wrong: int, correct: int) -> Check:
     """Return a check that no source set uses the source `wrong` for `quantity`."""
-    return expect(right, *_name_sources(quantity), allows=lambda source: source != wrong)
+    return expect(correct, *_name_sources(quantity), allows=lambda source: source != wrong)
 
 
 def _has_source(parameters: Parameters, source: int) -> bool:
@@ -163,7 +163,7 @@ def _has_source(parameters: Parameters, source: int) -> bool:
 
 
 def _check_source_set(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """Yield the changes that add our source to a source set: else it is never used (AP_NavEKF_Source.cpp)."""
+    """Yield the changes that add our source to a source set: otherwise it is never used (AP_NavEKF_Source.cpp)."""
     if choice.channel is Channel.GPS_INPUT and not _has_source(parameters, _SOURCE_GPS):
         yield f"EK3_SRC1_POSXY={_SOURCE_GPS}"
     if choice.channel is Channel.ODOMETRY and not _has_source(parameters, _SOURCE_VISION):
@@ -171,7 +171,7 @@ def _check_source_set(parameters: Parameters, choice: ChannelChoice) -> Iterator
 
 
 def _check_set_per_lane(parameters: Parameters, _choice: ChannelChoice) -> Iterator[str]:
-    """Yield the change that frees EKF lane n from source set n (AP_NavEKF_Source.h, getActiveSourceSet)."""
+    """Yield the change that detaches EKF lane n from source set n (AP_NavEKF_Source.h, getActiveSourceSet)."""
     options = parameters.get("EK3_SRC_OPTIONS", 0)
     is_mixed = _has_source(parameters, _SOURCE_GPS) and _has_source(parameters, _SOURCE_VISION)
     if has_bit(options, _SET_PER_LANE_BIT) and is_mixed:
@@ -220,10 +220,10 @@ _RULES = (
         Check(_name_sources("POSXY"), _check_source_set),
         "No source set of the filter uses our position.", "EK3_SRCn_POSXY"),
     require(_GPS_INPUT, "not 3",  # AP_NavEKF3_PosVelFusion.cpp, selectHeightForFusion
-        _refuse_source("POSZ", _SOURCE_GPS, right=_SOURCE_BARO),
+        _refuse_source("POSZ", _SOURCE_GPS, correct=_SOURCE_BARO),
         "The height would come from our receiver, which repeats the autopilot's own height.", "EK3_SRCn_POSZ"),
     require(_GPS_INPUT, "not 8",  # EKFGSF_yaw.cpp: accelerations have to fit the receiver's velocity
-        _refuse_source("YAW", _SOURCE_GSF, right=_SOURCE_COMPASS),
+        _refuse_source("YAW", _SOURCE_GSF, correct=_SOURCE_COMPASS),
         "The heading would come from our velocity, which is computed with the autopilot's own heading.",
         "EK3_SRCn_YAW"),
     recommend(_CONTINUOUS, f"above 0, up to {_MAX_GLITCH_RADIUS_M}",  # SelectVelPosFusion
@@ -233,7 +233,7 @@ _RULES = (
         "1, or with bits 8 (GPS) and 262144 (vision); newer firmware: ARMING_SKIPCHK without these bits",
         Check(("ARMING_CHECK",), _check_arming), "It arms even if our positions are missing or contradict GPS."),
     # AP_VisualOdom_MAV.cpp: VISO_VEL_M_NSE is used as the accuracy, whatever we send.
-    require(_ODOMETRY, "not 6", _refuse_source("VELXY", _SOURCE_VISION, right=0),
+    require(_ODOMETRY, "not 6", _refuse_source("VELXY", _SOURCE_VISION, correct=0),
         "Our velocity comes from the same matches as our position; the filter would trust it more than its gyros.",
         "EK3_SRCn_VELXY"),
     require(_ODOMETRY, "POSZ, VELZ and YAW not 6",

@@ -1,4 +1,4 @@
-"""Channels: the messages that carry positions to an autopilot. Its parameters decide which one is used: see
+"""Channels: the messages that carry positions to an autopilot. Its parameters determine the channel: see
 `ardupilot_parameters` and `px4_parameters`."""
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ class Channel(Enum):
         return self not in (Channel.NONE, Channel.COMMAND)
 
     @property
-    def is_beside_gps(self) -> bool:
+    def works_with_gps(self) -> bool:
         """True if positions are also sent while the autopilot has GPS."""
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)
 
@@ -60,7 +60,7 @@ _MAV_TYPES = {
 @dataclass(frozen=True, slots=True)
 class ChannelChoice:
     """The channel chosen for an autopilot, and the `reason`. For GPS_INPUT, `receiver` is the index of the GPS receiver
-    that we replace (0: the first), and `lag_s` the age that the autopilot assumes for our positions."""
+    that we simulate (0: the first), and `lag_s` the age that the autopilot assumes for our positions."""
 
     channel: Channel
     reason: Reason
@@ -75,7 +75,7 @@ class ChannelChoice:
 
 def classify_vehicle(mav_type: int) -> VehicleKind:
     """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE). A VTOL aircraft counts as a plane:
-    it dead-reckons like one in forward flight, and its type does not show whether it hovers."""
+    in forward flight it dead-reckons like one, and its type does not tell whether it hovers."""
     return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), VehicleKind.OTHER)
 
 

@@ -1,4 +1,4 @@
-"""Requests an autopilot's version and parameters in flight, and chooses the channel for positions by them."""
+"""Requests an autopilot's version and parameters in flight, and chooses the channel for positions accordingly."""
 
 import logging
 import math
@@ -17,8 +17,8 @@ from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
 
 MAX_PARALLEL_REQUESTS = 10  # ArduPilot drops requests beyond 20 (GCS_Param.cpp, param_requests)
 ROUND_INTERVAL_S = 1.0
-MIN_ROUND_INTERVAL_S = 0.1  # after a round in which every request was answered
-MAX_SILENT_ROUNDS = 4  # after as many rounds without any answer, the pauses grow
+MIN_ROUND_INTERVAL_S = 0.1  # after a round with an answer to every request
+MAX_SILENT_ROUNDS = 4  # after this many rounds without any answer, the pauses grow
 MAX_PAUSE_S = 30.0
 REFRESH_INTERVAL_S = 2.0  # between repeated requests of known parameters, to detect changes in flight
 MIN_ROUNDS_TO_ABSENT = 4
@@ -38,11 +38,11 @@ class ChannelSelector:
 
     Unanswered requests are repeated after a second or, while nothing at all is answered, after growing pauses. Known
     parameters are requested again, one every two seconds, and values that arrive unrequested are also used. After a
-    change the channel is chosen again. Old firmware does not answer requests for a parameter that it does not have. The
-    parameter counts as absent after four rounds in which others were answered, or more on a link that loses messages.
+    change the channel is chosen again. Old firmware does not answer requests for a parameter that it lacks. Such a
+    parameter counts as absent after four rounds with answers for others, or more on a link that loses messages.
 
-    `choice`: the channel. Before the first requests it is command 43003, for programs that send fixes by themselves and
-    need no reports. Then it is `Channel.NONE` until all parameters that it depends on are known."""
+    `choice`: the channel. Before the first requests it is command 43003, for programs that only send fixes and
+    need no reports. Then it is `Channel.NONE` until all parameters that determine it are known."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
@@ -54,7 +54,7 @@ class ChannelSelector:
         self._version_requests = 0
         self._absent: set[str] = set()
         self._requests: Counter[str] = Counter()
-        self._unanswered: Counter[str] = Counter()  # rounds in which another name was answered, but not this one
+        self._unanswered: Counter[str] = Counter()  # rounds with an answer for another name, but not for this one
         self._pending: set[str] = set()  # names requested in the last round, and not yet answered
         self._answers = 0
         self._silent_rounds = self._refresh_index = 0
@@ -124,7 +124,7 @@ class ChannelSelector:
             self._decide()
 
     def _record_answer(self, name: str) -> None:
-        """Record an answer for one parameter: it shows that the autopilot receives our requests."""
+        """Record an answer for one parameter, which proves that the autopilot receives our requests."""
         self._version_requests *= bool(self._values)
         self._silent_rounds = 0
         self._answers += name in self._pending
@@ -134,8 +134,8 @@ class ChannelSelector:
             self._due_s = min(self._due_s, self._requested_s + interval_s)
 
     def _mark_absent(self) -> None:
-        """Mark parameters as absent if, given the share of answers that arrive, it is almost impossible that all their
-        answers were lost. Each other parameter that may be absent counts as one lost answer."""
+        """Mark parameters as absent if, given the fraction of answers that arrive, it is almost impossible that all
+        their answers were lost. Each other parameter that may be absent counts as one lost answer."""
         unknown = {name for name in self._unanswered.keys() - self._values.keys() if not self._is_known(name)}
         lost_answers = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
         answer_probability = (self._answers + 1) / (self._answers + lost_answers + 2)
@@ -157,8 +157,8 @@ class ChannelSelector:
         return not names.isdisjoint(self._values) or names <= self._absent
 
     def _find_missing(self) -> list[str]:
-        """Return the names to request: those that decide the channel, then those that the channel needs, then the rest,
-        each group with the least requested names first. An alternative name is requested if the first has no answer."""
+        """Return the names to request: those that determine the channel, then those that it requires, then the rest,
+        in each group those requested least often first. An alternative name is requested if the first has no answer."""
         if not (table := self._table):
             return []
         needed = table.list_needed(table.choose(self._kind, self._values))
@@ -172,8 +172,8 @@ class ChannelSelector:
         return [name for *_, name in sorted(missing)]
 
     def _choose_refresh(self, is_only_request: bool) -> list[str]:
-        """Return the name to request again, if any: a known one or, if it is the only request, also an absent one, as
-        all its answers may have been lost."""
+        """Return the name to request again, if any: a known one or, if it is the only request, also an absent one,
+        because all its answers may have been lost."""
         names = list(self._values)
         if is_only_request:
             names += [name for name in self._absent if ALTERNATIVES.get(name) not in self._values]

@@ -14,22 +14,22 @@ from edgevpr.mavlink.wire import Message, mavlink
 HEARTBEAT_TIMEOUT_S = 5.0  # five heartbeats, which are sent once a second
 TIMESYNC_TIMEOUT_S = 5.0  # without an answer
 _REQUEST_INTERVAL_S = 1.0
-_URGENT_REQUEST_INTERVAL_S = 0.25
+_URGENT_REQUEST_INTERVAL_S = 0.25  # while the clock is unknown, or after a gap
 _MAX_ANSWER_AGE_S = 10.0  # two quartz clocks drift apart by at most 1 ms in this time
 _MAX_CLOCK_DRIFT_S = 1e-3
-_MAX_REQUESTS = 64  # requests with pending answers; only a very slow link has as many
-_MIN_STEP_BACK_S = 1.0  # a boot time that goes back by more than this belongs to another boot
-_RESTART_CHECK_S = 3.0  # after a gap in heartbeats; an autopilot that sends no boot time in it counts as restarted
+_MAX_REQUESTS = 64  # requests with pending answers; only a very slow link has this many
+_MIN_STEP_BACK_S = 1.0  # a boot time that goes back by more than this is that of another boot
+_RESTART_CHECK_S = 3.0  # after a gap in heartbeats; without a boot time in it, the autopilot counts as restarted
 _UTC_ROUNDING_S = 5e-3  # boot times are sent in whole milliseconds
 _MAX_STAMP_ERROR_S = 1.0
 JITTER_LAG_S = 0.5  # `max_lag_ms` of ArduPilot's JitterCorrection
-_JITTER_SAMPLES = 200  # our stamps affected by a foreign one: two rounds of `convergence_loops`, the first partial
+_JITTER_SAMPLES = 200  # our timestamps affected by a foreign one: two rounds of `convergence_loops`, the first partial
 # Only messages stamped when they are sent: others carry the time of a measurement, which may be old.
 _BOOT_TIME_MESSAGES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
 _WRAP_MS = 2**32
 _WRAP_MARGIN_MS = 60_000
-MAX_REPORT_DELAY_S = 0.5  # reports with a longer delay are not used: at 20 m/s they are off by 10 m
-_MIN_PUNCTUAL_S = 10.0  # without a late report
+MAX_REPORT_DELAY_S = 0.5  # reports with a longer delay are not used: at 20 m/s they are wrong by 10 m
+_MIN_PUNCTUAL_S = 10.0  # without a late report, before reports count as on time
 # The messages that share ArduPilot's single timestamp correction per link, with the name of their timestamp field: all
 # callers of `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` except command 43003.
 _STAMP_FIELDS = {
@@ -75,8 +75,8 @@ class AutopilotClock:
         self._boot_ms: dict[str, int] = {}  # last boot time by kind of message
         self._gap_end_s: float | None = None  # when heartbeats resumed after a gap; None: no restart suspected
         self._is_same_boot = False  # boot times have continued since the gap
-        self._utc_ahead_s: float | None = None  # UTC minus boot time
-        self._utc_ahead_of_ours_s: float | None = None  # UTC minus our time, used if the boot time is unknown
+        self._utc_minus_boot_s: float | None = None
+        self._utc_minus_mono_s: float | None = None  # used if the boot time is unknown
 
     def make_request(self, now_s: float) -> Message | None:
         """Return the TIMESYNC to send at `now_s`; None if none is due."""
@@ -126,20 +126,20 @@ class AutopilotClock:
     def utc_s(self, t_mono_s: float) -> float | None:
         """Return the autopilot's UTC at `t_mono_s` in seconds since 1970; None if it is unknown."""
         boot_s = self.boot_time_s(t_mono_s)
-        if boot_s is not None and self._utc_ahead_s is not None:
-            return boot_s + self._utc_ahead_s
-        return None if self._utc_ahead_of_ours_s is None else t_mono_s + self._utc_ahead_of_ours_s
+        if boot_s is not None and self._utc_minus_boot_s is not None:
+            return boot_s + self._utc_minus_boot_s
+        return None if self._utc_minus_mono_s is None else t_mono_s + self._utc_minus_mono_s
 
     def delay_s(self, boot_ms: int, now_s: float) -> float:
         """Return the transport delay in seconds of a report stamped `boot_ms`; 0.0 if the autopilot's clock is unknown.
-        The delay is at least half the last round trip: if the report is not late, then our messages are."""
+        The delay is at least half the last round trip: if the report is not late, our messages are."""
         boot_s = self.boot_time_s(now_s)
         if boot_s is None:
             return 0.0
         return max(math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
 
     def _handle_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
-        """Process the answer to the request sent at `sent_s`. Returns True if it belongs to another boot."""
+        """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""
         answer, old_best = _Answer(now_s, boot_s - now_s, boot_s - sent_s), self._best
         last = self._answers[-1] if self._answers else None
         if last and boot_s < last.t_s + last.low_s - _MIN_STEP_BACK_S:
@@ -148,7 +148,7 @@ class AutopilotClock:
             if answer.high_s < old_best.low_s - _MIN_STEP_BACK_S:
                 return True
             self._gap_end_s = None
-        # Answers that contradict the newest one date from before one of the clocks paused.
+        # Answers that contradict the newest one are from before a pause of one of the clocks.
         kept = (old for old in self._answers if now_s - old.t_s <= _MAX_ANSWER_AGE_S and not old.contradicts(answer))
         self._answers = [*kept, answer]
         self._best = min(self._answers, key=lambda answer: answer.round_trip_s)
@@ -169,13 +169,13 @@ class AutopilotClock:
         """Process a SYSTEM_TIME: UTC and boot time of one instant, from one clock. Their difference is constant except
         for the rounding of the boot time, so its first value is kept until it changes by more than that."""
         utc_s, boot_s = message.time_unix_usec / 1e6, message.time_boot_ms / 1e3
-        self._utc_ahead_of_ours_s = utc_s - now_s
+        self._utc_minus_mono_s = utc_s - now_s
         expected_s = self.boot_time_s(now_s)
         if expected_s is None:
             return
         boot_s += round((expected_s - boot_s) * 1e3 / _WRAP_MS) * _WRAP_MS / 1e3
-        if self._utc_ahead_s is None or abs(utc_s - boot_s - self._utc_ahead_s) > _UTC_ROUNDING_S:
-            self._utc_ahead_s = utc_s - boot_s
+        if self._utc_minus_boot_s is None or abs(utc_s - boot_s - self._utc_minus_boot_s) > _UTC_ROUNDING_S:
+            self._utc_minus_boot_s = utc_s - boot_s
 
 
 class ReportDelay:
@@ -205,15 +205,15 @@ class ReportDelay:
 
 class ForeignStamps:
     """Finds timestamps of other programs that are not in the autopilot's time. ArduPilot has one timestamp correction
-    for all senders of a link (`JitterCorrection`). After a stamp that is ahead of its time, it treats our messages as
+    for all senders of a link (`JitterCorrection`). After a timestamp ahead of its own time, it treats our messages as
     sent 0.5 s before they arrive."""
 
     def __init__(self) -> None:
         self._reported: set[tuple[str, str]] = set()
-        self._spoilt_stamps = 0  # number of our next stamps that ArduPilot will read as too old
+        self._spoilt_stamps = 0  # number of our next timestamps that ArduPilot will treat as too old
 
     def take_lag_s(self) -> float:
-        """Return by how many seconds ArduPilot will read the stamp that we send now as too old."""
+        """Return the seconds by which ArduPilot will treat the timestamp that we send now as too old."""
         if self._spoilt_stamps == 0:
             return 0.0
         self._spoilt_stamps -= 1

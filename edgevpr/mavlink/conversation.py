@@ -1,4 +1,4 @@
-"""The conversation with the autopilot, independent of port and thread. Used inside turns only (see `turns`)."""
+"""The conversation with the autopilot, independent of port and thread. It is used only inside turns (see `turns`)."""
 
 import logging
 import math
@@ -24,10 +24,10 @@ from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 MAX_MESSAGES = 64
 HEARTBEAT_INTERVAL_S = 1.0
 STATE_INTERVAL_S = 0.1  # ArduPilot treats a GPS receiver as unhealthy if its positions are more than 215 ms apart
-HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
+HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy while the link's thread still runs
 INTERIM_FIX_INTERVAL_S = 0.5  # between fixes sent without a new match
 REQUEST_INTERVAL_S = 5.0
-ORIGIN_TIMEOUT_S = 5.0  # an autopilot that has an origin sends it once a second on request
+ORIGIN_TIMEOUT_S = 5.0  # an autopilot with an origin sends it once a second on request
 
 log = logging.getLogger(__name__)
 
@@ -68,11 +68,11 @@ class Conversation:
         self._heartbeat_due_s = self._state_due_s = self._interim_fix_due_s = clock()
         self._next_request_s: float | None = None  # when to request reports next; None: they are not needed
         self._restarts, self._restart_reported_s = 0, -math.inf
-        self._reported_channel: Channel | None = self.channel  # as last reported to the listener
+        self._reported_channel: Channel | None = self.channel  # last one reported to the listener
         self._has_requested_continuous: bool | None = None
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
-        self._was_alive: bool | None = None  # as last announced; None: no heartbeat yet
+        self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
 
     @property
     def channel(self) -> Channel:
@@ -96,8 +96,8 @@ class Conversation:
 
     def take_interim_fixes(self) -> list[FixTransmission]:
         """Return the fixes sent between matches since the last call."""
-        taken, self.interim_fixes = list(self.interim_fixes), deque(maxlen=MAX_MESSAGES)
-        return taken
+        fixes, self.interim_fixes = list(self.interim_fixes), deque(maxlen=MAX_MESSAGES)
+        return fixes
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Queue a status text; at most one is sent every five seconds. `topic`: see `Texts`."""
@@ -119,7 +119,7 @@ class Conversation:
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
     def wait_s(self, max_wait_s: float) -> float:
-        """Return how many seconds, at most `max_wait_s`, the link may sleep until the next message is due."""
+        """Return the seconds, at most `max_wait_s`, that the link may sleep until the next message is due."""
         due_in_s = self._state_due_s - self._clock() if self.channel.is_continuous else max_wait_s
         return min(max_wait_s, max(0.0, due_in_s))
 
@@ -193,7 +193,7 @@ class Conversation:
         self.fixes.drop_stale(self._clock())
 
     def end(self) -> None:
-        """Give up all fixes: queued ones, and those that await an answer."""
+        """Drop all fixes: queued ones, and those that await an answer."""
         self.fixes.cancel_awaited(Reason(ReasonCode.ENDED_BEFORE_ANSWER))
         self.fixes.drop_stale(math.inf)
 
@@ -312,7 +312,7 @@ class Conversation:
         self._restart_reported_s = now_s
 
     def _handle_stamp(self, message: Message, now_s: float) -> None:
-        """Announce a wrong timestamp of another program, which also makes ArduPilot misread ours."""
+        """Announce a wrong timestamp of another program, which also makes ArduPilot misinterpret ours."""
         own_id = self._packer.srcSystem, self._packer.srcComponent
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
         if sender in (own_id, (own_id[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:

@@ -19,10 +19,10 @@ from edgevpr.mavlink.turns import Turns
 MAX_SLEEP_S = 0.25  # longest sleep of the thread, if nothing wakes it
 FIRST_RETRY_S = 0.2
 MAX_RETRY_S = 2.0
-DEPARTURE_CHECK_S = 0.01  # interval of checks whether a fix has left the operating system
+DEPARTURE_CHECK_S = 0.01  # interval of checking whether a fix has left the operating system
 FLUSH_TIMEOUT_S = 0.5
 
-PortState = tuple[bool, str | None]  # connected?, why not (or None)
+PortState = tuple[bool, str | None]  # whether it is connected, and the reason if not
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +101,7 @@ class PortDriver:
                     self._work(self._writer, timeout_s=MAX_SLEEP_S)
             except (OSError, LinkError) as error:
                 self._handle_loss(error)
-            except Exception as error:  # reopening the link is better than losing it
+            except Exception as error:  # reopen the link instead of losing it
                 log.exception("the link failed")
                 self._handle_loss(error)
         self._flush()
@@ -116,7 +116,7 @@ class PortDriver:
         self._writer = self._open()
 
     def _work(self, writer: PacketWriter, timeout_s: float) -> None:
-        """Write as much as the port accepts, wait up to `timeout_s` for something to do, then read."""
+        """Write as much as the port accepts, wait up to `timeout_s` for data or a wake-up, then read."""
         with self._turns.take_link_turn():
             if writer.port.connected:
                 self._transmit(writer)
@@ -138,7 +138,7 @@ class PortDriver:
                 log.info("%s is back", self._address)
                 self._trouble = None
         with self._turns.take_link_turn():
-            self._count_sent_fixes(writer)  # before answers to them are read
+            self._count_sent_fixes(writer)  # before their answers are read
             self._settings.signing.verdicts.clear()
             has_heartbeat = self._conversation.handle(data, self._turns.now_s(), writer.port.sender)
             # An autopilot that has the key but an old clock learns the time from our signed messages.

@@ -1,9 +1,9 @@
 """Position fixes in transit to the autopilot: queued ones, and those that await an answer. Used by `conversation`
-inside turns only.
+only inside turns.
 
-A fix is never sent late, and after five unanswered fixes in a row only occasional ones are sent. COMMAND_ACK does not
-identify the fix that it answers, so it is matched to the oldest fix sent less than a second ago. With one fix a second,
-and answers within some tens of milliseconds, there is only one such fix. An answer without a fix is only counted.
+A fix is never sent late, and after five consecutive unanswered fixes only occasional ones are sent. COMMAND_ACK does
+not identify the fix that it answers, so it is matched to the oldest fix sent less than a second ago. With one fix a
+second, and answers within tens of milliseconds, there is only one such fix. An answer without a fix is only counted.
 """
 
 import logging
@@ -22,9 +22,9 @@ MAX_QUEUED_FIXES = 8
 # Longest time from `put` until a fix is sent, in all buffers together. types.MAX_FIX_AGE_S limits the age of its frame,
 # which is sent with the fix.
 MAX_FIX_WAIT_S = 1.0
-MAX_UNANSWERED = 5  # after as many unanswered fixes in a row, sending stops until one is answered
+MAX_UNANSWERED = 5  # after this many consecutive unanswered fixes, sending stops until one is answered
 RETRY_INTERVAL_S = 10.0  # interval of the fixes sent while sending is stopped
-ANSWER_TIMEOUT_S = 1.0  # answers take some tens of milliseconds, over a radio up to half a second
+ANSWER_TIMEOUT_S = 1.0  # answers take tens of milliseconds, over a radio up to half a second
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class FixTransmission:
         self._settled.set()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` seconds until the fix is sent or given up."""
+        """Wait up to `timeout_s` seconds until the fix is sent or dropped."""
         self._settled.wait(timeout_s)
 
 
@@ -81,8 +81,8 @@ class Fixes:
         self._accepted_s = -math.inf  # time of the newest fix that was, or may have been, accepted
         self._last_answer: tuple[str, Reason] | None = None
         self._sent_s = -math.inf
-        self._unanswered_row = 0  # consecutive fixes without an answer
-        self._is_stopped = False  # as last announced
+        self._consecutive_unanswered = 0
+        self._is_stopped = False  # last announced state
         self._resumes_s = -math.inf
 
     def __len__(self) -> int:
@@ -91,7 +91,7 @@ class Fixes:
 
     @property
     def t_fix_s(self) -> float:
-        """Time of the newest fix that the autopilot may be using: one that it has not refused (-inf: none)."""
+        """Time of the newest fix that the autopilot may be using, because it has not refused it (-inf: none)."""
         return max(self._accepted_s, self._awaited[-1][0] if self._awaited else -math.inf)
 
     def put(self, fix: Fix, now_s: float) -> FixTransmission:
@@ -111,15 +111,15 @@ class Fixes:
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
 
-    def drop_stale(self, now_s: float, lack: ReasonCode = ReasonCode.NO_AUTOPILOT) -> None:
-        """Drop the fixes that have waited too long, with the reason `lack`."""
+    def drop_stale(self, now_s: float, why: ReasonCode = ReasonCode.NO_AUTOPILOT) -> None:
+        """Drop the fixes that have waited too long, with the reason `why`."""
         for transmission in self._waiting:
             if now_s > transmission.due_s:
-                self._drop(transmission, Reason(lack, {"limit_s": self._max_wait_s}))
+                self._drop(transmission, Reason(why, {"limit_s": self._max_wait_s}))
         self._waiting = deque(transmission for transmission in self._waiting if transmission.sent is None)
 
     def withhold(self, why: Reason) -> None:
-        """Give up all queued fixes, with the reason `why`."""
+        """Drop all queued fixes, with the reason `why`."""
         self.withheld += len(self._waiting)
         for transmission in self._waiting:
             transmission.settle(False, why)
@@ -127,7 +127,7 @@ class Fixes:
 
     def find_objection(self, now_s: float) -> Reason | None:
         """Return the reason why no fix may be sent now; None if fixes may be sent."""
-        if self._unanswered_row >= MAX_UNANSWERED and now_s - self._sent_s < RETRY_INTERVAL_S:
+        if self._consecutive_unanswered >= MAX_UNANSWERED and now_s - self._sent_s < RETRY_INTERVAL_S:
             return Reason(ReasonCode.FIXES_UNANSWERED)
         if now_s < self._resumes_s:
             return Reason(ReasonCode.ANSWERS_RESUMED)
@@ -136,22 +136,22 @@ class Fixes:
     def record_sent(self, transmission: FixTransmission, now_s: float) -> None:
         """Record that a fix was handed to the port."""
         transmission.t_sent_s = self._sent_s = now_s
-        self._unanswered_row += 1
+        self._consecutive_unanswered += 1
         self._awaited.append((now_s, transmission))
 
     def record_lost(self, count: int) -> None:
         """Record that `count` fixes were lost with the port. They do not count as unanswered, except while sending is
         stopped, which only an answer ends."""
         if not self._is_stopped:
-            self._unanswered_row -= count
+            self._consecutive_unanswered -= count
         self.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
 
     def handle(self, result: str, reason: Reason, now_s: float) -> FixTransmission | None:
         """Process an answer. `result`: name of a MAV_RESULT. `reason`: explains it. Returns its fix, if any."""
         if self._is_stopped:
-            # Answers to the unanswered fixes may arrive now, and must not be matched to a new fix.
+            # Late answers may arrive now, and must not be matched to a new fix.
             self._resumes_s = now_s + ANSWER_TIMEOUT_S
-        self._unanswered_row = 0
+        self._consecutive_unanswered = 0
         self.time_out(now_s)
         is_accepted = result == "ACCEPTED"
         if (result, reason) != self._last_answer:
@@ -185,17 +185,17 @@ class Fixes:
     def report_silence(self, why_silent: Reason, now_s: float) -> None:
         """Report when fixes are no longer answered (with the likely reason `why_silent`), or are answered again."""
         self.time_out(now_s)
-        is_stopped = self._unanswered_row >= MAX_UNANSWERED
+        is_stopped = self._consecutive_unanswered >= MAX_UNANSWERED
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWER_TIMEOUT_S):
             return
         self._is_stopped = is_stopped
         if is_stopped:
             log.warning(
-                "no answer to five fixes in a row (%s): now sending one every %g s", why_silent, RETRY_INTERVAL_S
+                "no answer to five consecutive fixes (%s): now sending one every %g s", why_silent, RETRY_INTERVAL_S
             )
             self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.code.summary}", "answers")
         else:
-            log.warning("position fixes are answered again: resuming to send them")
+            log.warning("position fixes are answered again: sending has resumed")
             self._announce(Severity.INFO, "fixes are answered again", "answers")
 
     def _drop(self, transmission: FixTransmission, why: Reason) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from edgevpr.mavlink.messages import Severity, make_status_text
 from edgevpr.mavlink.wire import Message, mavlink
 
-MAX_ANSWERS_PER_S = 50  # answers to a flood of requests must not crowd out our own messages
+MAX_ANSWERS_PER_S = 50  # answers to a flood of requests must not displace our own messages
 TEXT_INTERVAL_S = 5.0
 
 Announce = Callable[[Severity, str, str], None]  # sends a text to the ground station: severity, text and topic
@@ -30,7 +30,7 @@ class CommandRequest(NamedTuple):
 
 
 class Requests:
-    """Answers requests received over the link, and keeps the newest command until the flight's main loop takes it.
+    """Answers requests received over the link, and stores the newest command until the flight's main loop takes it.
     Commands are rejected until `is_flying` is set. Other messages to us, of an unknown kind or above the rate limit,
     are ignored. While `is_paused`, no fix may be sent."""
 
@@ -45,10 +45,10 @@ class Requests:
         waiting, self._waiting = self._waiting, None
         return waiting
 
-    def handle(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
-        """Process a message and return the replies. `us`: our (system id, component id). `now_s`: time by our clock."""
+    def handle(self, message: Message, own_id: tuple[int, int], now_s: float) -> tuple[Message, ...]:
+        """Process a message received at `now_s`, and return the replies. `own_id`: our (system id, component id)."""
         sender = message.get_srcSystem(), message.get_srcComponent()
-        if sender[0] == 0 or sender == us or not _needs_answer(message, us):
+        if sender[0] == 0 or sender == own_id or not _needs_answer(message, own_id):
             return ()
         kind = message.get_type()
         if kind not in ("TIMESYNC", "COMMAND_LONG", "COMMAND_INT") or not self._may_answer(now_s):
@@ -56,13 +56,13 @@ class Requests:
         if kind == "TIMESYNC":
             return (mavlink.MAVLink_timesync_message(tc1=round(now_s * 1e9), ts1=message.ts1),)
         is_command = message.command == mavlink.MAV_CMD_USER_1
-        result = self._keep_command(message.param1, sender) if is_command else int(mavlink.MAV_RESULT_UNSUPPORTED)
-        to = {"target_system": sender[0], "target_component": sender[1]}
-        return (mavlink.MAVLink_command_ack_message(message.command, result, **to),)
+        result = self._store_command(message.param1, sender) if is_command else int(mavlink.MAV_RESULT_UNSUPPORTED)
+        target = {"target_system": sender[0], "target_component": sender[1]}
+        return (mavlink.MAVLink_command_ack_message(message.command, result, **target),)
 
-    def _keep_command(self, code: float, sender: tuple[int, int]) -> int:
-        """Keep a command; it replaces one that is still waiting. Returns a MAV_RESULT."""
-        if code not in tuple(UserCommand):  # a whole float equals its integer, and NaN equals none
+    def _store_command(self, code: float, sender: tuple[int, int]) -> int:
+        """Store a command; it replaces one that is still waiting. Returns a MAV_RESULT."""
+        if code not in tuple(UserCommand):  # an integral float equals its integer; NaN equals nothing
             return int(mavlink.MAV_RESULT_DENIED)
         if not self.is_flying:
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
@@ -111,14 +111,14 @@ class Texts:
         return make_status_text(severity, f"edgevpr: {self._last[topic]}")
 
     def remove_pauses(self) -> None:
-        """Send the remaining texts without pauses, because the link is about to be closed."""
+        """Send the remaining texts without pauses, because the link will be closed."""
         self._spacing_s = 0.0
 
 
-def _needs_answer(message: Message, us: tuple[int, int]) -> bool:
+def _needs_answer(message: Message, own_id: tuple[int, int]) -> bool:
     """Return True if a message requests an answer from us: a TIMESYNC without `tc1`, or a message addressed to us
     alone. A broadcast command is not answered, because every component would acknowledge it."""
     if message.get_type() == "TIMESYNC":
         return bool(message.tc1 == 0)
     target = getattr(message, "target_system", None), getattr(message, "target_component", None)
-    return target == us and message.get_type() != "COMMAND_ACK"
+    return target == own_id and message.get_type() != "COMMAND_ACK"

@@ -24,8 +24,8 @@ MIN_JUMP_M = 2.0
 JUMP_M_PER_S = 5.0
 MAX_STEP_S = 5.0
 MIN_CONTRADICTION_M = 5.0
-CONTRADICTION_SHARE = 0.25
-MIN_CONTRADICTION_S = 3.0  # longer than the flight over a house
+CONTRADICTION_RATIO = 0.25
+MIN_CONTRADICTION_S = 3.0  # longer than a flight over a house
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ class Heights:
         self._changing_since_s: float | None = None  # when the range finder began to disagree with `contradiction_m`
 
     def handle(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
-        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR; `attitude` (None: unknown) corrects its slant."""
+        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR; `attitude` (None: unknown) corrects the slant range."""
         if message.get_type() == "TERRAIN_REPORT":
             self._handle_terrain(message, now_s)
         elif message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:
@@ -117,7 +117,7 @@ class Heights:
                 return step_m
         nearest_m = min(steps_m, key=lambda step_m: abs(step_m - climbed_m))
         self._has_jumped = True
-        if step_s > MAX_STEP_S or jumped_before:  # two jumps in a row: the climb rate is wrong, not the altitude
+        if step_s > MAX_STEP_S or jumped_before:  # two consecutive jumps: the climb rate is wrong, not the altitude
             return nearest_m
         jump_m = nearest_m - climbed_m
         self.jumped_m += jump_m
@@ -125,14 +125,14 @@ class Heights:
         return climbed_m
 
     def _check_range(self, now_s: float) -> None:
-        """Compare the range finder with the autopilot's height. A change counts once it has lasted some seconds."""
+        """Compare the range finder with the autopilot's height. A change counts after it has lasted a few seconds."""
         range_m = self._get_recent(self._range, now_s, RANGE_MAX_AGE_S)
         autopilot_m = self._compute_autopilot_height_m(now_s)
         if range_m is None:
             self._changing_since_s = None
             return
         difference_m = abs(range_m - autopilot_m)
-        differs = difference_m > max(MIN_CONTRADICTION_M, CONTRADICTION_SHARE * abs(autopilot_m))
+        differs = difference_m > max(MIN_CONTRADICTION_M, CONTRADICTION_RATIO * abs(autopilot_m))
         if differs == (self.contradiction_m is not None):
             self._changing_since_s = None
             self.contradiction_m = difference_m if differs else None
@@ -143,8 +143,8 @@ class Heights:
             return
         self.contradiction_m, self._changing_since_s = difference_m if differs else None, None
         if differs:
-            text = f"height {autopilot_m:.0f} m, by range finder {range_m:.0f} m"
-            self._report(text, "the two contradict each other", "range finder")
+            text = f"height {autopilot_m:.0f} m, range finder {range_m:.0f} m"
+            self._report(text, "they contradict each other", "range finder")
         else:
             self._announce(Severity.INFO, "height and range finder agree again", "range finder")
 

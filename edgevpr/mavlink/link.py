@@ -22,7 +22,7 @@ class LinkStats:
 
     `trouble`: why the port could not be opened or was lost; None once data arrives again. `foreign_messages`: messages
     from another autopilot or address. `withheld_fixes`: fixes not sent because of unanswered ones or a pause.
-    `refused_why`: reason of the last refused fix. `bad_bytes`: bytes that belong to no message. `answered_s`: time of
+    `refused_why`: reason of the last refusal. `bad_bytes`: bytes outside any message. `answered_s`: time of
     the last answer to our commands, by number."""
 
     connected: bool
@@ -54,18 +54,14 @@ class LinkStats:
 
 class Link:
     """The link to one flight controller. Its `conversation` makes the messages to send and processes received ones; it
-    is used inside `turns` only. `drive` makes the driver, which moves packets through the port.
+    is used only inside `turns`. `drive` makes the driver, which moves packets through the port.
 
     All methods except `start` and `close` may be called from any thread; they never wait for the other end, and never
     raise. Methods without a docstring are those of `Conversation`.
     """
 
     def __init__(
-        self,
-        address: LinkAddress,
-        settings: LinkSettings,
-        turns: Turns | None = None,
-        drive: DriverMaker = PortDriver,
+        self, address: LinkAddress, settings: LinkSettings, turns: Turns | None = None, drive: DriverMaker = PortDriver
     ) -> None:
         self.turns = turns or Turns(settings.clock)
         with self.turn("begin"):
@@ -77,20 +73,20 @@ class Link:
         missing device or server is not such a fault: `stats` gives the reason."""
         self._driver.start()
 
-    def turn(self, what: str) -> AbstractContextManager[None]:
-        """Take a turn: a context manager during which the link is idle and its clock stands still (see `Turns`)."""
-        return self.turns.take_turn(what)
+    def turn(self, name: str) -> AbstractContextManager[None]:
+        """Context manager: take exclusive use of the link, whose clock stands still meanwhile (see `Turns`)."""
+        return self.turns.take_turn(name)
 
     def send(self, *outgoing: Message) -> None:
-        with self._sending("send"):
+        with self._send_turn("send"):
             self.conversation.send(*outgoing)
 
     def send_fix(self, fix: Fix) -> FixTransmission:
-        with self._sending("send_fix"):
+        with self._send_turn("send_fix"):
             return self.conversation.send_fix(fix)
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        with self._sending("announce"):
+        with self._send_turn("announce"):
             self.conversation.announce(severity, text, topic)
 
     def accept_commands(self) -> None:
@@ -168,8 +164,8 @@ class Link:
         self.close()
 
     @contextmanager
-    def _sending(self, what: str) -> Iterator[None]:
+    def _send_turn(self, name: str) -> Iterator[None]:
         """Context manager: take a turn, then wake the driver's thread."""
-        with self.turn(what):
+        with self.turn(name):
             yield
         self._driver.wake()

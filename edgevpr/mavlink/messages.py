@@ -19,7 +19,7 @@ AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAX_TEXT_BYTES = 50
 SENSOR_ID = 1  # `id` in message 296; must equal EKF2_AGP0_ID, whose value 0 would disable the slot
 _YAW_SD_RAD = math.radians(5.0)
-# A reserve must never outrank a real receiver with a 3D fix, which needs four satellites. At equal fix type ArduPilot
+# A fallback must never outrank a real receiver with a 3D fix, which needs four satellites. At equal fix type ArduPilot
 # switches to the receiver with more satellites, and blends by accuracy (AP_GPS::update_primary, AP_GPS_Blended).
 _FALLBACK_SATELLITES = 2
 _FALLBACK_SD_M = 100.0
@@ -61,16 +61,16 @@ class Fix:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # this form also rejects NaN
             raise ValueError(f"latitude {self.lat_deg}, longitude {self.lon_deg} is not a position on Earth")
         if not 0 < self.accuracy_m < math.inf:
-            raise ValueError(f"an accuracy of {self.accuracy_m} m is invalid: it must be finite and above zero")
+            raise ValueError(f"the accuracy is {self.accuracy_m} m, but must be finite and above zero")
         if not math.isfinite(self.t_frame_s):
-            raise ValueError(f"a frame time of {self.t_frame_s} s is invalid: it must be finite")
+            raise ValueError(f"the frame time is {self.t_frame_s} s, but must be finite")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionState:
     """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
     standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
-    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_fallback`: a fallback, as real GPS has a fix."""
+    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_fallback`: GPS is in use, so this is a fallback."""
 
     t_mono_s: float
     lat_deg: float
@@ -196,7 +196,7 @@ def make_odometry(
 
 def make_vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
     """Make an ODOMETRY (331) with only a position, north, east, down relative to `origin` (latitude, longitude in
-    degrees, altitude in metres above sea level). PX4 learns our clock from our answers to its TIMESYNC."""
+    degrees, altitude in metres above sea level). PX4 synchronises with our clock by our answers to its TIMESYNC."""
     variances = [math.nan] * 21  # upper triangle of the 6 x 6 covariance, row by row
     variances[0] = variances[6] = state.accuracy_m**2
     variances[11] = state.alt_accuracy_m**2
@@ -297,7 +297,7 @@ def make_computer_status(
         ram_total=ram_total_bytes >> 20,
         cpu_cores=percents + [255] * (8 - len(percents)),
         temperature_core=[temperature] + [127] * 7,
-        # The other fields are not measured. MAVLink marks them by the largest value of their type.
+        # The other fields are not measured: MAVLink encodes this as the largest value of their type.
         cpu_combined=[255] * 10,
         gpu_cores=[255] * 4,
         gpu_combined=[255] * 10,
@@ -309,7 +309,7 @@ def make_computer_status(
 
 
 def make_status_text(severity: Severity, text: str) -> Message:
-    """Make a STATUSTEXT (253), cut to 50 bytes: not every ground station supports text in chunks."""
+    """Make a STATUSTEXT (253), truncated to 50 bytes: not every ground station supports text in chunks."""
     data = text.encode()
     if len(data) > MAX_TEXT_BYTES:
         data = data[: MAX_TEXT_BYTES - 3].decode(errors="ignore").encode() + b"..."

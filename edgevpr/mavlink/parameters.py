@@ -1,5 +1,5 @@
 """The tables of an autopilot's parameters, and the choice of a channel from them. A table lists every parameter that
-affects our messages, the correct values, and the effect of wrong ones.
+affects our messages, its correct values, and the effect of wrong ones.
 
 The rules are in `ardupilot_parameters` and `px4_parameters`. They are used by the flight, which sends nothing while a
 parameter is unanswered or dangerous, by `edgevpr doctor`, and by the page docs/reference/parameters.md.
@@ -29,7 +29,7 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterRule:
-    """A row of a table. `label`: the name that a pilot looks up. `channels`: the channels that it matters for. `right`:
+    """A row of a table. `label`: the name that a pilot looks up. `channels`: the channels that it applies to. `right`:
     the correct values, in words. `why`: the effect of a wrong value, in a sentence."""
 
     label: str
@@ -102,7 +102,7 @@ class ParameterTable:
 
     def decide(self, kind: VehicleKind, parameters: Parameters, is_known: Callable[[str], bool]) -> Decision:
         """Choose the channel. `parameters`: the values read. `is_known` returns whether a parameter's value was read,
-        or the autopilot is known not to have that parameter."""
+        or the autopilot is known to lack that parameter."""
         if missing := tuple(name for name in self.deciding if not is_known(name)):
             return _decide_to_wait(missing)
         choice = self.choose(kind, parameters)
@@ -136,7 +136,7 @@ def recommend(channels: tuple[Channel, ...], right: str, check: Check, why: str,
 
 def expect(advised: float, *names: str, allows: Callable[[float], bool] | None = None) -> Check:
     """Return a check that advises NAME=`advised` for each parameter whose value `allows` rejects (by default any value
-    but `advised`). A parameter that the autopilot does not have counts as correct."""
+    except `advised`). A parameter that the autopilot lacks counts as correct."""
 
     def find_changes(parameters: Parameters, _choice: ChannelChoice) -> Iterator[str]:
         for name in names:

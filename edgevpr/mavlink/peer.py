@@ -29,7 +29,7 @@ _MILLI_G_M_S2 = 9.80665e-3
 # Reports of the vehicle's position and motion; the first three carry the boot time.
 _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
-_ORIGIN_TIMEOUT_S = 2.0  # an autopilot that has not answered the request by then has no origin
+_ORIGIN_TIMEOUT_S = 2.0  # an autopilot that has not answered the request in this time has no origin
 _ORIGIN_REQUEST_INTERVAL_S = 10.0
 REPLACEMENT_SILENCE_S = 30.0  # a flight controller restarts within 20 s
 
@@ -43,17 +43,18 @@ class Endpoint(NamedTuple):
     address: Sender | None
 
     def __str__(self) -> str:
-        where = f" at {self.address[0]}:{self.address[1]}" if self.address else ""
-        return f"system {self.system_id}{where}"
+        location = f" at {self.address[0]}:{self.address[1]}" if self.address else ""
+        return f"system {self.system_id}{location}"
 
 
 class Identity:
-    """Decides which sender is our autopilot, `kept`: the first one or, if `system_id` is set, the first with that id.
-    A sender with another system id never replaces it. A sender with the same system id at another address replaces it
-    once it has been silent for 30 s; then it `has_moved`. `foreign_messages` counts the messages of other senders."""
+    """Decides which sender is our autopilot, `current`: the first one or, if `system_id` is set, the first with that
+    id. A sender with another system id never replaces it. A sender with the same system id at another address replaces
+    it once it has been silent for 30 s; then it `has_moved`. `foreign_messages` counts the messages of other
+    senders."""
 
     def __init__(self, system_id: int | None = None) -> None:
-        self.kept: Endpoint | None = None
+        self.current: Endpoint | None = None
         self.foreign_messages = 0
         self._configured = system_id
         self._received_s = -math.inf
@@ -63,41 +64,41 @@ class Identity:
     def admits(self, endpoint: Endpoint, is_heartbeat: bool, now_s: float) -> bool:
         """Return True if this endpoint is our autopilot. It may become ours if its message `is_heartbeat`."""
         self.has_moved = False
-        if is_heartbeat and endpoint != self.kept and self._may_replace(endpoint, now_s):
-            if self.kept is None:
+        if is_heartbeat and endpoint != self.current and self._may_replace(endpoint, now_s):
+            if self.current is None:
                 log.info("connected to autopilot (%s)", endpoint)
             else:
                 silent_s = now_s - self._received_s
-                log.warning("the autopilot is now %s: %s has been silent for %.0f s", endpoint, self.kept, silent_s)
+                log.warning("the autopilot is now %s: %s has been silent for %.0f s", endpoint, self.current, silent_s)
                 self.has_moved = True
-            self.kept, self._has_warned = endpoint, False
-        if endpoint != self.kept:
+            self.current, self._has_warned = endpoint, False
+        if endpoint != self.current:
             # Do not count while any sender may still become our autopilot.
-            self.foreign_messages += self.kept is not None or self._configured is not None
+            self.foreign_messages += self.current is not None or self._configured is not None
             return False
         self._received_s = now_s
         return True
 
     def is_foreign(self, address: Sender | None) -> bool:
         """Return True if bytes from this address cannot come from our autopilot, which has another address."""
-        return self.kept is not None and address != self.kept.address
+        return self.current is not None and address != self.current.address
 
     def _may_replace(self, endpoint: Endpoint, now_s: float) -> bool:
         """Return True if the heartbeat of another endpoint makes that endpoint our autopilot."""
-        kept = self.kept
-        if kept is None and self._configured in (None, endpoint.system_id):
+        current = self.current
+        if current is None and self._configured in (None, endpoint.system_id):
             return True
         if not self._has_warned:  # two vehicles on one link are dangerous
             self._has_warned = True
-            ours = kept or f"system {self._configured}"
-            advice = "give each vehicle a link of its own, or set mavlink.system_id and restart edgevpr"
+            ours = current or f"system {self._configured}"
+            advice = "use a separate link for each vehicle, or set mavlink.system_id and restart edgevpr"
             log.warning("another autopilot, %s, is on this link: fixes are sent to %s only; %s", endpoint, ours, advice)
-        is_same = kept is not None and endpoint.system_id == kept.system_id
+        is_same = current is not None and endpoint.system_id == current.system_id
         return is_same and now_s - self._received_s >= REPLACEMENT_SILENCE_S
 
 
 class Listener:
-    """Base class for objects that navigate by the autopilot's reports and estimate the positions to send; it does
+    """Base class for objects that process the autopilot's reports and estimate the positions to send; it does
     nothing. The link's thread calls the methods, which must never block or raise."""
 
     def handle_autopilot(self, t_s: float) -> None:
@@ -137,7 +138,7 @@ class Autopilot:
         self._listener, self._component_id, self._announce = listener, component_id, announce
         self.heartbeat_s = -math.inf  # time of its last heartbeat through the currently open port
         self.answer: str | None = None  # name of a MAV_RESULT, if the last message answered a fix
-        self.has_restarted = False  # shown by the last message
+        self.has_restarted = False  # according to the last message
         self._reset()
 
     def _reset(self) -> None:
@@ -157,10 +158,10 @@ class Autopilot:
     @property
     def system_id(self) -> int | None:
         """System id of the autopilot; None until its first heartbeat."""
-        return self.identity.kept.system_id if self.identity.kept else None
+        return self.identity.current.system_id if self.identity.current else None
 
     def stamp_s(self, t_mono_s: float) -> float | None:
-        """Return `t_mono_s` as a timestamp for it; None if its clock is unknown. PX4 converts our timestamps itself."""
+        """Return `t_mono_s` as a timestamp for the autopilot; None if its clock is unknown. PX4 converts it itself."""
         return t_mono_s if self.firmware == mavlink.MAV_AUTOPILOT_PX4 else self.clock.stamp_s(t_mono_s)
 
     def is_alive(self, now_s: float) -> bool:
@@ -175,7 +176,7 @@ class Autopilot:
         return True
 
     def assess_readiness(self, now_s: float) -> Readiness:
-        """Return its readiness to accept a fix, as far as it is known."""
+        """Return the autopilot's readiness to accept a fix, as far as it is known."""
         return Readiness(
             is_px4=self.firmware == mavlink.MAV_AUTOPILOT_PX4,
             is_armed=self.is_armed,
@@ -186,13 +187,13 @@ class Autopilot:
         )
 
     def _is_origin_missing(self, now_s: float) -> bool:
-        """Return True if its origin was requested and not received in time; during a request, the previous result."""
+        """Return True if the origin was requested and not received in time; during a request, the previous result."""
         is_late = self._was_origin_missing or now_s - self._origin_request_s > _ORIGIN_TIMEOUT_S
         return self._origin_s < self._origin_request_s and is_late
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report, extrapolated to `t_mono_s`: see `Conversation.predict_vehicle`."""
-        vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
+        vehicle, attitude = self.vehicle, self.attitudes.interpolate(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_received_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
             lat_deg, lon_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, east_m, north_m)
@@ -213,10 +214,10 @@ class Autopilot:
             return False
         kind = message.get_type()
         is_heartbeat = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
-        previous = self.identity.kept
+        previous = self.identity.current
         if not self.identity.admits(Endpoint(message.get_srcSystem(), address), is_heartbeat, now_s):
             return False
-        is_other = self.identity.kept != previous
+        is_other = self.identity.current != previous
         self.has_restarted = not is_other and self.clock.handle(message, now_s)
         if is_other or self.has_restarted:
             self._reset()
@@ -246,7 +247,7 @@ class Autopilot:
                 self.answer = answer = entry.name.removeprefix("MAV_RESULT_") if entry else str(message.result)
                 self.acks[answer] += 1
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
-                self.heights.handle(message, now_s, self.attitudes.at(now_s))
+                self.heights.handle(message, now_s, self.attitudes.interpolate(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
                 self.receivers.handle(message, now_s)
                 if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
@@ -260,7 +261,7 @@ class Autopilot:
                 self._handle_position(message, now_s)
             case "ATTITUDE":
                 self.attitudes.handle(message, now_s)
-            case "SCALED_IMU" if attitude := self.attitudes.at(now_s):
+            case "SCALED_IMU" if attitude := self.attitudes.interpolate(now_s):
                 self.imu_s = now_s
                 force_m_s2 = tuple(axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
                 self._listener.handle_force(now_s, force_m_s2, attitude)
@@ -274,7 +275,7 @@ class Autopilot:
         """Process a GLOBAL_POSITION_INT. If its position is invalid, or 0, 0, `vehicle` becomes None."""
         gps, lat_deg, lon_deg = self._choose_receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
-        # On a continuous channel the estimate may derive from our own positions, so it proves nothing about GPS.
+        # On a continuous channel the estimate may be derived from our positions, so it is no evidence of GPS.
         has_gps = bool(gps) and (is_near or self.selector.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
             self.accuracy.record_accuracy(gps.sd_m, now_s)

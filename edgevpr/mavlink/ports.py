@@ -19,10 +19,10 @@ from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.fixes import FixTransmission
 
 CONNECT_TIMEOUT_S = 1.0
-TCP_TIMEOUT_MS = 1000  # if bytes are not acknowledged by then, the connection is closed and they are lost
-TCP_BUFFER_BYTES = 8192  # doubled by the system, about 30 messages; the default is megabytes
+TCP_TIMEOUT_MS = 1000  # if bytes are not acknowledged in this time, the connection is closed and they are lost
+TCP_BUFFER_BYTES = 8192  # doubled by the system; about 30 messages, while the default is megabytes
 READ_BYTES = 65_536
-LOST = Reason(ReasonCode.LINK_LOST)
+LINK_LOST = Reason(ReasonCode.LINK_LOST)
 WRITE_TIMEOUT_S = 0.5  # a port that accepts no bytes for this long is reopened: the waiting bytes would leave late
 
 
@@ -58,7 +58,7 @@ class Port:
         return 0
 
     def reply_to_sender(self) -> None:
-        """Send to the sender of the last bytes read from now on. No effect if there can be only one sender."""
+        """From now on, send to the sender of the last bytes read. No effect if there can be only one sender."""
 
     def unsent(self) -> int:
         """Return the number of written bytes that have not left the system or, over TCP, are not acknowledged."""
@@ -72,7 +72,7 @@ class Port:
 
 
 def _open_udp(connect: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
-    """Return a UDP socket attached to an address by `connect`: `bind` or `connect`. Closes the socket if that fails."""
+    """Return a UDP socket attached to an address by `connect`: `bind` or `connect`. Close the socket if this fails."""
     with ExitStack() as stack:
         sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         connect(sock, (host, port))
@@ -146,10 +146,10 @@ class TcpPort(Port):
 class SerialPort(Port):
     """A serial port, written through its file descriptor: pyserial's own write spins when the buffer is full."""
 
-    _loss_message = "the device is gone"
+    _loss_message = "the device was disconnected"
 
     def __init__(self, device: str, baud: int) -> None:
-        import serial  # not at the top: no other kind of link needs it
+        import serial  # not at the top, because other kinds of links do not need it
 
         if not stat.S_ISCHR(os.stat(device).st_mode):
             raise ValueError("it is not a serial device")
@@ -192,15 +192,15 @@ _ADVICE = {  # by error, and whether the link is serial
 
 def open_port(address: LinkAddress) -> Port:
     """Open the port of a link. Raises LinkAddressError for a wrong address, LinkError for another fault that the user
-    must correct (a port in use, no permission), and OSError for a fault that may disappear by itself (no device)."""
+    must correct (a port in use, no permission), and OSError for a fault that may end without action (no device)."""
     is_serial = address.kind == "serial"
     try:
-        return _PORT_TYPES[address.kind](address.where, address.number)
+        return _PORT_TYPES[address.kind](address.target, address.number)
     except (socket.gaierror, UnicodeError) as error:
         # The host may be found later: no name server has answered, or a .local host has yet to announce itself.
         is_unresolved = isinstance(error, socket.gaierror) and error.errno != socket.EAI_NONAME
-        kind = LinkError if is_unresolved or address.where.endswith(".local") else LinkAddressError
-        raise kind(f"{address}: host {address.where!r} not found: correct it, or give an IP address.") from error
+        kind = LinkError if is_unresolved or address.target.endswith(".local") else LinkAddressError
+        raise kind(f"{address}: host {address.target!r} not found: correct it, or use an IP address.") from error
     except ValueError as error:
         raise LinkAddressError(f"{address} cannot be opened ({error}): correct the device or baud rate.") from error
     except OSError as error:
@@ -268,5 +268,5 @@ class PacketWriter:
                 self.port.discard_on_close()
         self.port.close()
         for _, transmission in self.pending_fixes:
-            transmission.settle(False, LOST)
+            transmission.settle(False, LINK_LOST)
         return len(self.pending_fixes)

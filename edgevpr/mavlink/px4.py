@@ -1,10 +1,10 @@
-"""Whether PX4 uses GPS and our positions, from its filter's report (ESTIMATOR_STATUS).
+"""Infers whether PX4 uses GPS and our positions, from its filter's report (ESTIMATOR_STATUS).
 
-While PX4 uses our positions, it does not reset its position to a GPS that has recovered, however far off ours are
-(EKF2, `isGnssPosResetAllowed`). We must therefore stop sending before it can use GPS again, but only once PX4 shows
-that it would: as soon as its checks of the receiver pass, it fuses the receiver's velocity, whatever our positions are.
-Based on the sources of 1.18 (`Ekf::get_ekf_soln_status`, `getHorizontalVelocityInnovationTestRatio`), and compared with
-the real 1.17.0 and 1.18-beta1."""
+While PX4 uses our positions, it does not reset its position to a recovered GPS, however wrong ours are
+(EKF2, `isGnssPosResetAllowed`). We must therefore stop sending before it can use GPS again, but only when PX4 shows
+that it would: as soon as its checks of the receiver pass, it fuses the receiver's velocity, regardless of our
+positions. Based on the sources of 1.18 (`Ekf::get_ekf_soln_status`, `getHorizontalVelocityInnovationTestRatio`), and
+compared with the real 1.17.0 and 1.18-beta1."""
 
 import math
 
@@ -17,9 +17,9 @@ _FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 _SENSOR_TIMEOUT_S = 6.0  # after our last message 296, whose flag PX4 keeps set for 5 s
 _VISION_TIMEOUT_S = 1.0  # ODOMETRY has a flag of its own, so only the end of our messages must be detected
-_MIN_UNUSED_S = 2.0  # PX4 must not use a receiver with a fix for this long, as the fix may be new or just lost
+_MIN_UNUSED_S = 2.0  # PX4 must not use a receiver with a fix for this long: the fix may be new or just lost
 _SENDING_TIMEOUT_S = 1.0
-# A recovered receiver must be steady for this long before we stop sending; less would follow an intermittent receiver.
+# A recovered receiver must be steady for this long before we stop sending: it may be intermittent.
 _MIN_STEADY_S = 1.5
 _FIRST_PAUSE_S = 30.0  # after an attempt in which PX4 did not use GPS; doubled each time
 _MAX_PAUSE_S = 240.0
@@ -40,7 +40,7 @@ class Px4Fusion:
 
     @property
     def used_share(self) -> float | None:
-        """Share of reports in which our positions are used; None without reports."""
+        """Fraction of reports in which our positions are used; None without reports."""
         count = self.used + self.unused
         return self.used / count if count else None
 

@@ -19,7 +19,7 @@ from edgevpr.mavlink.parameters import (
 
 POSITION_BIT = 1  # bit of EKF2_AGPn_CTRL
 AGP_CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
-VISION_CONTROL = "EKF2_EV_CTRL"  # more bits may belong to another system; before 1.16 the default is 15
+VISION_CONTROL = "EKF2_EV_CTRL"  # other bits may be for another system; before 1.16 the default is 15
 
 _ALL_CHANNELS = (Channel.COMMAND, Channel.SENSOR, Channel.VISION)
 _CONTINUOUS = (Channel.SENSOR, Channel.VISION)

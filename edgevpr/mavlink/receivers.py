@@ -26,7 +26,7 @@ _MAX_GAP_S = 1.5  # a receiver that is silent for longer is no longer steady
 
 @dataclass(frozen=True, slots=True)
 class _TrackedReceiver:
-    """A receiver with a 3D fix: its newest report, the autopilot's timestamp of it, and since when it is steady."""
+    """A receiver with a 3D fix: its newest report, the report's timestamp, and the time since which it is steady."""
 
     report: Receiver
     time_usec: int
@@ -70,8 +70,8 @@ class Receivers:
 def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float] | None = None) -> tuple[float, float]:
     """Return latitude and longitude of a receiver at `t_s`, extrapolated from its report and lag with `velocity_m_s`,
     m/s (east, north; None: use the receiver's own velocity)."""
-    since_s = t_s - receiver.t_s + RECEIVER_LAG_S
-    east_m, north_m = (since_s * speed_m_s for speed_m_s in velocity_m_s or receiver.velocity_m_s or (0.0, 0.0))
+    elapsed_s = t_s - receiver.t_s + RECEIVER_LAG_S
+    east_m, north_m = (elapsed_s * speed_m_s for speed_m_s in velocity_m_s or receiver.velocity_m_s or (0.0, 0.0))
     return offset_position(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
 
 
@@ -95,7 +95,7 @@ def _read_velocity(message: Message) -> tuple[float, float] | None:
 
 
 def _is_continuous(before: Receiver, report: Receiver) -> bool:
-    """Return True if a report follows the one `before` without a gap or a jump."""
+    """Return True if a report follows the report `before` without a gap or a jump."""
     interval_s = report.t_s - before.t_s
     if interval_s > _MAX_GAP_S:
         return False

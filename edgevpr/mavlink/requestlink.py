@@ -35,10 +35,10 @@ class RequestLink(AbstractContextManager["RequestLink"]):
     """A link to one autopilot whose methods wait for each answer. It sends a heartbeat once a second, because some
     autopilot ports only answer a sender of heartbeats. As a context manager it raises LinkError if the link is lost.
 
-    - `system_id`: system id of the autopilot; None until its first heartbeat, unless one was given.
+    - `system_id`: system id of the autopilot; None until its first heartbeat, unless configured.
     - `received`: number of messages from the autopilot, by name; `signed`: number of signed messages among them.
     - `sends_mavlink1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
-    - `other_systems`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
+    - `other_systems`: system ids of other autopilots on the link; `reader` counts bytes outside any message."""
 
     def __init__(
         self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
@@ -73,7 +73,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         return self._wait_for(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
-        """Receive messages for `wait_s` seconds and count them, without requesting any."""
+        """Receive and count messages for `wait_s` seconds, without requesting any."""
         self._wait_for(wait_s, lambda message: False)
 
     def request_message(self, message_id: int) -> Message | None:
@@ -94,7 +94,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
     def request_parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
         """Request parameters by name (PARAM_REQUEST_READ) and return their values by name, without those that the
-        autopilot does not have or whose value is not finite. For `bytewise` see `read_parameter_value`."""
+        autopilot lacks or whose value is not finite. For `bytewise` see `read_parameter_value`."""
         values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
         for _ in range(MAX_TRIES):
@@ -165,7 +165,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotReading:
-    """Everything that an autopilot reports about itself; None or empty if it did not answer."""
+    """The values that an autopilot reports about itself; None or empty if it did not answer."""
 
     system_id: int
     firmware: str  # "ardupilot", "px4" or "other"
@@ -183,7 +183,7 @@ class AutopilotReading:
     answers: bool  # it has answered a request
     sends_mavlink1: bool  # it sends MAVLink 1
     other_systems: tuple[int, ...]  # system ids of other autopilots on the link
-    bad_bytes: int  # bytes that belong to no valid message
+    bad_bytes: int  # bytes outside any valid message
     round_trip_s: float | None  # median round trip of requests
     clock_ahead_s: float | None  # its UTC minus that of this machine
 
@@ -193,7 +193,7 @@ class AutopilotReading:
 
 
 def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
-    """Read, within ten seconds, everything that an autopilot reports about itself; return None if no heartbeat arrives.
+    """Read, within ten seconds, what an autopilot reports about itself; return None if no heartbeat arrives.
     `wanted`: names of the parameters to read, by firmware. Their names in other releases are also tried."""
     heartbeat = link.wait_for_heartbeat()
     if heartbeat is None:
@@ -213,7 +213,7 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
         mavlink.MAVLINK_MSG_ID_ATTITUDE,
     )
     names = tuple(wanted.get(firmware, ())) if answers else ()
-    # If the autopilot does not answer, each request would take three seconds. The last two messages are only counted.
+    # Without answers, each request would take three seconds. The last two messages are only counted.
     filter_state, gps_1, gps_2, origin, clock, *_ = (link.request_message(n) if answers else None for n in message_ids)
     parameters = link.request_parameters(names, is_px4)
     other_names = (ALTERNATIVES.get(name) for name in names if name not in parameters)

@@ -2,7 +2,7 @@
 back, neither within a flight nor between flights. Used by the link and by `edgevpr check` and `doctor`.
 
 pymavlink signs sent messages. Its check of received messages is not used: it stores the timestamp of a message before
-it compares the signature, so a single forged message with a timestamp far in the future would lock out all true ones.
+it compares the signature, so a single forged message with a timestamp far in the future would block all valid ones.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ _MAX_STAMP = 2**48 - 1  # timestamps have six bytes
 _MAX_STREAM_OFFSET = 60 * TICKS_S
 _SAVE_INTERVAL = 30 * TICKS_S
 # Each start adds a minute to the largest timestamp that may have been used. All earlier messages, sent and received,
-# are then more than a minute old, so nobody can replay them as a new stream.
+# are then more than a minute old and cannot be replayed as a new stream.
 _START_ADVANCE = _SAVE_INTERVAL + 60 * TICKS_S
 
 KEY_BYTES = 32
@@ -41,9 +41,9 @@ FUTURE = "time stamp from the future"
 _KEY_ADVICE = "create one with `(umask 077; head -c 32 /dev/urandom > FILE)`"
 
 REFUSAL_MEANINGS = {
-    UNSIGNED: "the other end does not sign: give it the key, or remove `mavlink.signing_key`",
+    UNSIGNED: "the other end does not sign: configure the key there, or remove `mavlink.signing_key`",
     WRONG: "the other end has a different key, or the messages are forged",
-    OLD: "normal just after a start; otherwise they are replayed, or the other end does not receive our messages",
+    OLD: "normal just after a start; otherwise messages are replayed, or the other end does not receive ours",
     FUTURE: "the clock of this sender is wrong, or the clocks of all other senders",
 }
 
@@ -55,8 +55,8 @@ log = logging.getLogger(__name__)
 
 class TimeStamps:
     """The largest timestamp ever sent or received, and the last one of every stream (the messages of one sender with
-    one link id). Any thread may call it. The largest is saved in the file `path`, because a board without a clock chip
-    starts with an old time. It is written at the start (raises ConfigError), and then every half minute.
+    one link id). Any thread may call it. The largest is saved in the file `path`, because a board without a real-time
+    clock starts with an old time. It is written at the start (raises ConfigError), and then every half minute.
 
     If `is_saved` is False the file is only read. A check before the flight does so, because it may run as root, and the
     service could not overwrite a file of root."""
@@ -82,7 +82,7 @@ class TimeStamps:
         """Return why a message with this timestamp is rejected, or None if it is admitted. An admitted timestamp is
         stored, so check the signature first. The timestamps of a stream must increase. The first of a new stream must
         be within a minute of the largest. The very first stream may be ahead: it sets the time of a board without a
-        clock chip."""
+        real-time clock."""
         with self._lock:
             now = max(self._largest, self._now())
             if stamp <= self._streams.get(stream, now - _MAX_STREAM_OFFSET):
@@ -96,9 +96,9 @@ class TimeStamps:
             return None
 
     def _now(self) -> int:
-        """Return the current timestamp: by the system clock or, if later, by the base and the monotonic clock."""
-        by_system = int((self._utc_s() - _EPOCH_S) * TICKS_S)
-        return max(by_system, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
+        """Return the current timestamp: that of the system clock or, if later, of the base and the monotonic clock."""
+        system_stamp = int((self._utc_s() - _EPOCH_S) * TICKS_S)
+        return max(system_stamp, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
 
     def _rebase(self, stamp: int) -> None:
         self._base, self._base_s = stamp, self._mono_s()
@@ -212,5 +212,5 @@ def _read_stamp(path: Path) -> int:
     except OSError as error:
         raise ConfigError(f"{path}: the signing timestamp cannot be read ({error.strerror}).") from error
     if not (text.isascii() and text.isdigit() and int(text) <= _MAX_STAMP):
-        raise ConfigError(f"{path} contains no signing timestamp: set the board's clock, and delete the file.")
+        raise ConfigError(f"{path} contains no signing timestamp: set the board's clock, then delete the file.")
     return int(text)

@@ -1,4 +1,4 @@
-"""Turns: one thread at a time uses a conversation, and the conversation's clock stands still meanwhile."""
+"""Turns: exclusive use of a conversation by one thread at a time. Its clock stands still during a turn."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from threading import RLock
 
 
 class Turns:
-    """Gives turns to one thread at a time. A conversation depends only on its input and the times of its turns."""
+    """Gives a turn to one thread at a time. A conversation depends only on its input and the times of its turns."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -19,18 +19,18 @@ class Turns:
         return self._clock() if t_s is None else t_s
 
     @contextmanager
-    def take_turn(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn in the flight's thread, or continue its current one. `what` names the turn."""
+    def take_turn(self, name: str) -> Iterator[None]:
+        """Context manager: take a turn in the flight's thread, or continue its current one. `name` is for the tape."""
         with self._lock:
             if self._t_s is not None:
                 yield
                 return
-            with self.freeze_clock(self._begin(what)):
+            with self.freeze_clock(self._begin(name)):
                 yield
 
     @contextmanager
     def freeze_clock(self, t_s: float) -> Iterator[None]:
-        """Context manager: make the time stand still at `t_s`. A replay repeats the link's turns with it."""
+        """Context manager: make the time stand still at `t_s`. A replay uses it to repeat the link's turns."""
         self._t_s = t_s
         try:
             yield
@@ -43,6 +43,6 @@ class Turns:
         with self._lock, self.freeze_clock(self._clock()):
             yield
 
-    def _begin(self, what: str) -> float:
+    def _begin(self, name: str) -> float:
         """Begin a turn of the flight's thread, and return its time."""
         return self._clock()

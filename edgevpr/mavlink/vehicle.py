@@ -9,9 +9,9 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
-_HISTORY_S = 3.0  # length of the attitude history: frames are hardly ever older when they are recognised
+_HISTORY_S = 3.0  # length of the attitude history: frames are rarely older when they are recognised
 _MAX_ATTITUDES = 200
-_MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and a frame that it is used for
+_MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and the frame that uses it
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
 # four times as fast, which is four standard deviations.
 DRIFT_M_S = 5.0
@@ -37,23 +37,23 @@ class Attitudes:
     """The attitudes of the last three seconds."""
 
     def __init__(self) -> None:
-        self._kept: tuple[Attitude, ...] = ()
+        self._history: tuple[Attitude, ...] = ()
 
     def rate_hz(self, now_s: float) -> float:
         """Return the rate of attitudes received in the last three seconds."""
-        return sum(now_s - attitude.t_s <= _HISTORY_S for attitude in self._kept) / _HISTORY_S
+        return sum(now_s - attitude.t_s <= _HISTORY_S for attitude in self._history) / _HISTORY_S
 
     def handle(self, message: Message, now_s: float) -> None:
         """Add the attitude of an ATTITUDE message; ignore one that is not finite."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
-            recent = [attitude for attitude in self._kept[1 - _MAX_ATTITUDES :] if now_s - attitude.t_s <= _HISTORY_S]
-            self._kept = (*recent, Attitude(now_s, *map(math.degrees, radians)))
+            recent = [past for past in self._history[1 - _MAX_ATTITUDES :] if now_s - past.t_s <= _HISTORY_S]
+            self._history = (*recent, Attitude(now_s, *map(math.degrees, radians)))
 
-    def at(self, t_s: float) -> Attitude | None:
-        """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; one neighbour is returned as is.
-        Return None if there is none."""
-        neighbours = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
+    def interpolate(self, t_s: float) -> Attitude | None:
+        """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; a single neighbour is returned.
+        None if there is no neighbour."""
+        neighbours = [attitude for attitude in self._history if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
         before = next((attitude for attitude in reversed(neighbours) if attitude.t_s <= t_s), None)
         after = next((attitude for attitude in neighbours if attitude.t_s > t_s), None)
         if before is None or after is None:
@@ -92,7 +92,7 @@ class PositionAccuracy:
         return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= MAX_FILTER_REPORT_AGE_S else None
 
     def record_accuracy(self, sd_m: float, now_s: float) -> None:
-        """Record the accuracy of the position at `now_s`, from GPS or an accepted fix of ours."""
+        """Record the accuracy of the position at `now_s`, from GPS or from a fix that was accepted."""
         self._last_known = sd_m, now_s
 
     def now(self, now_s: float) -> float | None:

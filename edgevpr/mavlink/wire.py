@@ -17,7 +17,7 @@ __all__ = ["Message", "PacketReader", "mavlink", "quaternion", "read_parameter_v
 
 Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
 
-_MAX_SENDERS = 8  # senders whose incomplete messages are kept; a flood from forged addresses must not fill the memory
+_MAX_SENDERS = 8  # senders whose incomplete messages are kept: packets from forged addresses must not fill the memory
 
 
 class PacketReader:
@@ -44,7 +44,7 @@ class PacketReader:
                 self.bad_bytes += len(message.data)
                 continue
             if isinstance(message, mavlink.MAVLink_unknown):
-                self.received["UNKNOWN"] += 1  # one name for all, as there are 16 million message numbers
+                self.received["UNKNOWN"] += 1  # one name for all, because there are 16 million message numbers
             elif self._admits(message):
                 self.received[message.get_type()] += 1
                 yield message
@@ -52,7 +52,7 @@ class PacketReader:
     def _find_parser(self, sender: Hashable) -> mavlink.MAVLink:
         if (parser := self.parsers.pop(sender, None)) is None:
             parser = mavlink.MAVLink(None)
-            parser.robust_parsing = True  # report bad data as BAD_DATA messages, not by exceptions
+            parser.robust_parsing = True  # report bad data as BAD_DATA messages, not as exceptions
             if len(self.parsers) == _MAX_SENDERS:
                 self.parsers.pop(next(iter(self.parsers)))
         self.parsers[sender] = parser

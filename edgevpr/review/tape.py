@@ -21,7 +21,7 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.driver import PortState
 from edgevpr.mavlink.fixes import FixTransmission
-from edgevpr.mavlink.ports import LOST
+from edgevpr.mavlink.ports import LINK_LOST
 from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
@@ -92,7 +92,7 @@ class ReplayedDriver:
                 conversation.count_sent_fixes(departed)
             case ["lost" | "closed" as event, *count]:
                 for transmission in self._outgoing:
-                    transmission.settle(False, LOST)
+                    transmission.settle(False, LINK_LOST)
                 self._outgoing.clear()
                 conversation.handle_port_loss(*count) if event == "lost" else conversation.end()
             case _:

@@ -169,7 +169,7 @@ def test_a_range_finder_that_contradicts_for_seconds_is_reported_once():
     vehicle.range_m = 60.0
     assert vehicle.fly(6.0) == 60.0
     assert vehicle.autopilot.vehicle.height_doubt_m == near(30.0)
-    assert vehicle.texts() == ["height 30 m, by range finder 60 m"]
+    assert vehicle.texts() == ["height 30 m, range finder 60 m"]
     vehicle.range_m = 31.0
     vehicle.fly(6.0)
     assert heights.contradiction_m is None

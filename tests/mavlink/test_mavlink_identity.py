@@ -31,7 +31,7 @@ def test_the_first_autopilot_heard_is_kept_while_it_speaks(caplog):
     assert identity.foreign_messages == 202
     for t_s in seconds(101, 400):
         assert not identity.admits(FOREIGN, True, t_s), "another system is never taken"
-    assert identity.kept == OURS
+    assert identity.current == OURS
     assert caplog.text.count("another autopilot, system 2") == 1
 
 
@@ -54,7 +54,7 @@ def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplo
     assert beat(identity, Endpoint(1, HERE), 100.0) == [True]
     assert not any(beat(identity, Endpoint(2, HERE), *seconds(101, 200)))
     assert beat(identity, Endpoint(1, THERE), 129.0, 130.0) == [False, True]
-    assert identity.kept == Endpoint(1, THERE)
+    assert identity.current == Endpoint(1, THERE)
 
 
 def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed(autopilot, caplog):

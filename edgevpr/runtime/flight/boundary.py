@@ -180,8 +180,8 @@ class TapedTurns(Turns):
                 if self.steps:
                     self.tape.note(LINK, self.now_s(), self.steps)
 
-    def _begin(self, what: str) -> float:
-        return self.tape.read(f"turn: {what}", partial(super()._begin, what))
+    def _begin(self, name: str) -> float:
+        return self.tape.read(f"turn: {name}", partial(super()._begin, name))
 
 
 class RecordedDriver(PortDriver):

@@ -247,7 +247,7 @@ class Navigator(Listener):
         if vehicle is None:
             return Output.STARTING
         uses_gps = is_gps_aided(vehicle)
-        if uses_gps and not self._channel.is_beside_gps:
+        if uses_gps and not self._channel.works_with_gps:
             return Output.GPS_IN_USE
         if estimate is None:
             return Output.STARTING if self.output is Output.STARTING else Output.UNKNOWN
@@ -284,7 +284,7 @@ class Navigator(Listener):
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
             # A channel used with GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
-            is_gps_recent = self._channel.is_beside_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
+            is_gps_recent = self._channel.works_with_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
             max_blind_s = _PX4_MAX_BLIND_S if self._channel in _PX4_CHANNELS else _MAX_BLIND_S
             is_known = t_s - last_vision_s <= max_blind_s or is_gps_recent
         else:
