@@ -40,7 +40,7 @@ def parse_package():
             "the runner-up (25%), 7 landmarks agree",
         ),
         ("LOW_SCORE", {"score": "damaged", "min_score": 0.1}, "not similar enough to any place"),
-        ("FILTER_READY", {"flags": 0x33F}, "has attitude and position (flags 0x33f)"),
+        ("FILTER_READY", {"flags": 0x33F}, "the EKF has attitude and position (flags 0x33f)"),
         ("LOG_NOT_A_FILE", {"path": "/"}, "/ is not a file in an existing folder: correct `log: {path: ...}`"),
         (
             "LINK_OPENED_DRY",

@@ -62,12 +62,7 @@ class Flight:
     """A flight with all its parts open. Create it with `open`; close it after `run`."""
 
     def __init__(
-        self,
-        parts: FlightParts,
-        camera: SourceConfig,
-        *,
-        min_accuracy_m: float,
-        fewer_candidates: tuple[int, ...],
+        self, parts: FlightParts, camera: SourceConfig, *, min_accuracy_m: float, fewer_candidates: tuple[int, ...]
     ) -> None:
         self._parts, self._opened = parts, ExitStack()
         notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()

@@ -30,14 +30,7 @@ class FlightMeter:
     loop. `thermal` is the newest measurement of temperature and supply, `limit_c` the temperature at which the board
     throttles itself. `machine` is the computer to measure (None: this one)."""
 
-    def __init__(
-        self,
-        battery: BatteryConfig,
-        board: Board,
-        clock: Clock,
-        *,
-        machine: Machine | None = None,
-    ) -> None:
+    def __init__(self, battery: BatteryConfig, board: Board, clock: Clock, *, machine: Machine | None = None) -> None:
         self._board, self._clock, self._machine = board, clock, machine or Machine(board)
         self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         self.energy = FlightEnergy(board, clock.mono_s, clock.process_cpu_s)

@@ -1,4 +1,4 @@
-"""Choice of a technique for a board, by accuracy and cost.
+"""Chooses a technique for a board, by accuracy and cost.
 
 The accuracy of each technique, for a downward or forward camera, was measured on image sets by `make results`. These
 figures (accuracy.json) are installed with the program, so that every cost can be shown with its accuracy.
@@ -23,12 +23,12 @@ from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
-_MAX_OBJECTIONS = 3  # reported if no option can be chosen
+_MAX_OBJECTIONS = 3  # number reported if no option can be chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """Accuracy of a technique in one form. `recall_at_1`: share of queries whose best place is correct, 0..1, averaged
+    """Accuracy of a technique in one form. `recall_at_1`: fraction of queries whose best place is correct, averaged
     over the `sets` image sets not used for tuning, with `queries` queries in total.
 
     The other fields are numbers of queries. `asked`: all queries of all image sets, including those used for tuning.
@@ -46,7 +46,7 @@ class Accuracy:
 
     @property
     def neighbours(self) -> str:
-        """Number of accepted wrong places that neighbour the correct one, such as " (+3 adjacent)" ("": none)."""
+        """Number of accepted wrong places adjacent to the correct one, such as " (+3 adjacent)" ("": none)."""
         count = self.accepted_wrong - self.accepted_elsewhere
         return f" (+{count} adjacent)" if count else ""
 
@@ -78,7 +78,7 @@ class Option:
 
     `t_query_s`: wall seconds per query. `cpu_s`: CPU-seconds per query, summed over all cores. `map_ram_mb`,
     `map_disk_mb`: size of the map's index in RAM, and of the map file. `process_ram_mb`: RAM of the process with the
-    index. `reachable_hz`: maximum queries per second. `misfit`: reason why it does not fit, worded to follow a name
+    index. `reachable_hz`: maximum queries per second. `misfit`: reason why it does not fit, to follow a name
     (None: it fits).
     """
 
@@ -96,15 +96,15 @@ class Option:
 
     @property
     def objection(self) -> str | None:
-        """Reason not to choose the option automatically, worded to follow its label; None if there is none."""
+        """Reason not to choose the option automatically, to follow its label; None if there is none."""
         if self.misfit:
             return self.misfit
         if self.accuracy is None:
-            return "was never measured: name it to use it"
+            return "was never measured: set it explicitly to use it"
         if self.accuracy.accepted_elsewhere:
-            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: name it to use it"
+            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: set it explicitly to use it"
         if self.costs.sequence > 1:
-            return "needs a flight along the mapped route: name it to use it"
+            return "needs a flight along the mapped route: set it explicitly to use it"
         return None
 
 
@@ -113,8 +113,8 @@ def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, dema
     the map, its process within the board's memory, and its queries within the CPU time. `label`: technique and form.
     `costs`: costs on `board`.
 
-    A query must end before the next one begins, and before its fix is too old to send. Together, queries may use the
-    share `cpu_share` of the cores.
+    A query must end before the next one begins, and before its fix is too old to send. Queries may use the
+    fraction `cpu_share` of all cores.
     """
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
@@ -157,15 +157,15 @@ def find_accuracy(label: str, camera: str | None, candidates: int | None = None)
 
 
 def list_fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
-    """Return the numbers of candidates below the default that a technique was measured with, largest first."""
+    """Return the numbers of candidates below the default with which a technique was measured, largest first."""
     names = _read_accuracies()[camera or "forward"]
     measured_labels = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
     return tuple(sorted((int(match[1]) for match in measured_labels if match), reverse=True))
 
 
 def choose_best(options: Sequence[Option], board: Board) -> Option | None:
-    """Choose the most accurate option without an objection; of equally accurate ones, the one with less CPU time.
-    Options of the technique that the board's profile names (`board.technique`) take precedence, even if none of them
+    """Choose the most accurate option without an objection; of equally accurate ones, that with the least CPU time.
+    Options of the technique in the board's profile (`board.technique`) take precedence, even if none of them
     was measured. Returns None if no option is suitable."""
     suitable = [option for option in options if option.objection is None]
     preferred = [option for option in suitable if option.name == board.technique]
@@ -182,14 +182,14 @@ def explain_no_choice(options: Sequence[Option], board: Board) -> str:
 
 
 def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
-    """Return the techniques to try if the user names none, best first: the one that the board's profile names, then the
+    """Return the techniques to try if none is configured, best first: the one in the board's profile, then the
     defaults. For a downward camera ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
-    if the board's profile names an unknown technique.
+    if the technique in the board's profile is unknown.
     """
     preferred = board.technique
     if preferred is not None and not techniques.is_known(preferred):
         raise ConfigError(
-            f"The profile of {board.title} names the unknown technique `{preferred}`: use one of "
+            f"The technique `{preferred}` in the profile of {board.title} is unknown: use one of "
             f"{', '.join(techniques.list_techniques())}."
         )
     names = dict.fromkeys((preferred, *techniques.DEFAULT_TECHNIQUES) if preferred else techniques.DEFAULT_TECHNIQUES)
@@ -218,6 +218,6 @@ def _read_accuracies() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _round_down(value: float) -> float:
-    """Round down to two significant digits, so that a reported rate is never above the rate reached."""
+    """Round down to two significant digits, so that a reported rate is never above the actual one."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.floor(value / step) * step

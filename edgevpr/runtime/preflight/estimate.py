@@ -1,5 +1,5 @@
-"""Estimate of a flight before take-off, shown by `edgevpr profile`: memory, time, charge and accuracy of each technique
-on a board: as measured, if it is this machine; else as far as instruction counts give them (see `instructions`).
+"""Estimates a flight before take-off, for `edgevpr profile`: memory, time, charge and accuracy of each technique
+on a board. They are measured if the board is this machine, else computed from instruction counts (see `instructions`).
 
 `dataclasses.asdict` of a FlightEstimate can be written as JSON.
 """
@@ -20,7 +20,7 @@ from edgevpr.runtime.preflight.trial import Trial
 class FlightPlan(Demand):
     """Plan of a flight: its requirements (`Demand`), and the inputs of its energy budget.
 
-    `flight_min`: flight time in minutes. `pack`: the aircraft's battery. `regulator_efficiency`: share of the pack's
+    `flight_min`: flight time in minutes. `pack`: the aircraft's battery. `regulator_efficiency`: fraction of the pack's
     energy that reaches the board, 0..1.
     """
 
@@ -35,8 +35,8 @@ class TechniqueEstimate:
 
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
     `flight_mah`: charge that the board draws during the flight. `flight_marginal_mah`: the part that the queries add to
-    an idle board (equation 5.7). `flight_pack_frac`: `flight_mah` as a share of the pack's capacity, which is also the
-    share of its endurance that the aircraft loses. All charges are drawn from the pack.
+    an idle board (equation 5.7). `flight_pack_frac`: `flight_mah` as a fraction of the pack's capacity, which is also
+    the fraction of its endurance that the aircraft loses. All charges are drawn from the pack.
     """
 
     option: Option
@@ -120,7 +120,7 @@ def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> Techniqu
 def _recommend(
     rows: list[TechniqueEstimate], unknown: list[str], board: Board, plan: FlightPlan
 ) -> tuple[str | None, str]:
-    """Return `recommended` and `reason` as in `FlightEstimate`. `unknown`: see there."""
+    """Return `recommended` and `reason` as in `FlightEstimate`, given its `unknown`."""
     options = [row.option for row in rows]
     if unknown and not options:
         return None, f"None: the cost of every technique is {explain_unknown_costs(board)}."
@@ -130,7 +130,7 @@ def _recommend(
     if chosen is None:
         return None, f"None: {explain_no_choice(options, board)}."
     row = rows[options.index(chosen)]
-    reason = "the board's profile names it, and it was never measured"
+    reason = "it is set in the board's profile, and was never measured"
     if chosen.accuracy:
         reason = f"the most accurate that fits: {chosen.accuracy}"
     return chosen.label, (

@@ -2,7 +2,7 @@
 
 Times are computed from the instruction counts of `make bench-arm64` and the instructions per second of one core of the
 board (`arm64_mips` in its profile): they are for the board's own instruction set, and unaffected by other programs.
-Memory is not converted. Of other techniques and boards, the costs are known only on the board itself.
+Memory is not converted. The costs of other techniques, and on other boards, are known only on the board itself.
 """
 
 import json
@@ -20,7 +20,7 @@ _COUNTED_SETTINGS = {"w1": 512, "w2": 16, "bins": 8, "entropy": "shannon", "matc
 
 
 def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return the instruction counts of the technique `name` with these parameters on an ARM core, by the field of
+    """Return the instruction counts of the technique `name` with these parameters on an ARM core, keyed by the field of
     `TechniqueCosts` that they determine; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
         return None
@@ -30,7 +30,7 @@ def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | N
 
 def compute_costs(costs: TechniqueCosts, board: Board, work: Mapping[str, float] | None) -> TechniqueCosts | None:
     """Return `costs`, measured on this machine, with the times of one core of another board, computed from the
-    instruction counts `work`. None: unknown, because they or the board's `arm64_mips` are."""
+    instruction counts `work`; None if these or the board's `arm64_mips` are unknown."""
     mips = board.benchmark_score.arm64_mips
     if work is None or mips is None:
         return None
@@ -39,5 +39,5 @@ def compute_costs(costs: TechniqueCosts, board: Board, work: Mapping[str, float]
 
 
 def explain_unknown_costs(board: Board) -> str:
-    """Return why costs on `board` are unknown, and what to do, worded to follow what they are of."""
+    """Return why costs on `board` are unknown, and what to do, to follow "the cost is"."""
     return f"unknown on {board.title}: run `edgevpr profile` on the board itself"

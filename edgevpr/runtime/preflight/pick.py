@@ -1,4 +1,4 @@
-"""Automatic choice of a technique for a new map, and the accuracy and cost of a flight's technique."""
+"""Chooses a technique for a new map, and describes the accuracy and cost of a flight's technique."""
 
 import logging
 from random import Random
@@ -34,7 +34,7 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
     """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
     (see `choose`). `camera`: "nadir" or "forward" (None: forward).
 
-    A technique whose cost on the board is unknown is chosen only if the board's profile names it, or if no cost is
+    A technique of unknown cost on the board is chosen only if it is set in the board's profile, or if no cost is
     known. If none fits the board, choose the first usable technique of `list_preferred` and log why it does not fit: a
     map is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
     """
@@ -46,7 +46,7 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
         try:
             technique = make_technique(board.threads, name, make_camera_setting(name, camera))
         except ModelError as error:
-            _log.warning("technique %s cannot be used: %s", name, error)
+            _log.warning("technique %s is unusable: %s", name, error)
             continue
         if costs := _measure_costs(technique, board):
             options.append(make_option(board, _make_label(technique.spec), name, costs, demand))
@@ -56,7 +56,7 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
         _log.warning("technique %s: its cost is %s", unknown[0], explain_unknown_costs(board))
         return unknown[0]
     if not options:
-        raise ModelError("No technique can be used: fix the problems listed above, or name another technique.")
+        raise ModelError("No technique is usable: fix the problems listed above, or use another technique.")
     chosen = choose_best(options, board)
     if chosen is None:
         _log.warning("using technique %s anyway: %s", options[0].name, explain_no_choice(options, board))
@@ -67,8 +67,8 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
 
 
 def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
-    """Return one line for the log: the technique that a flight uses, and why. `is_named`: the configuration names the
-    technique."""
+    """Return one line for the log: the technique that a flight uses, and why. `is_named`: it is set in the
+    configuration."""
     spec = recogniser.technique.spec
     parts = ["set in the configuration" if is_named else "the map was built with it"]
     if weights := describe_weights(spec):
@@ -84,15 +84,15 @@ def describe_accuracy(technique: Technique) -> str:
 
 
 def measure_query(recogniser: Recogniser, size_px: tuple[int, int]) -> float | None:
-    """Return the seconds that a query takes on this machine, with an image of noise of `size_px` (width, height), which
+    """Return the seconds that a query takes on this machine, with a noise image of `size_px` (width, height), which
     costs the most to match because every region has structure; None if the salience gate refuses it before the search.
     Raises EdgevprError if the query fails."""
     width_px, height_px = size_px
     image = np.frombuffer(Random(0).randbytes(height_px * width_px), np.uint8).reshape(height_px, width_px)
-    for number in range(recogniser.sequence + 1):  # until the sequence is complete; the first query warms up
+    for number in range(recogniser.sequence + 1):  # until the sequence is complete; the first query is a warm-up
         event = recogniser.step(Frame(image=image, name="noise", t_mono_s=float(number)))
     if event.failed:
-        raise EdgevprError(f"A query fails: {event.reason}.")
+        raise EdgevprError(f"The test query failed: {event.reason}.")
     return event.cost.whole.wall_s if event.ranking else None
 
 

@@ -1,4 +1,4 @@
-"""Estimates as text for people: tables of at most 120 columns with one row per technique, and notes."""
+"""Formats estimates as text: tables of at most 120 columns with one row per technique, and notes."""
 
 from edgevpr.core.text import align_table, wrap_sentence
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
@@ -11,7 +11,7 @@ _ACCURACY_COLUMNS = ("technique", "recall@1", "accepted", "wrong", "sets", "quer
 
 def format_table(estimate: FlightEstimate) -> str:
     """Format an estimate as text: the recommended technique, tables of cost and accuracy, the reasons why techniques do
-    not fit or cannot be used, and notes."""
+    not fit or are unusable, and notes."""
     plan, rows = estimate.plan, estimate.techniques
     heading = (
         f"{estimate.title}: {plan}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"

@@ -1,4 +1,4 @@
-"""Costs of a technique on this machine, measured in a short trial on generated images."""
+"""Measures the costs of a technique on this machine in a short trial on generated images."""
 
 import itertools
 import math
@@ -44,7 +44,7 @@ class TechniqueCosts:
 
     `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
     file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than
-    `max_matches` places are compared, only a proportional share of it is paid. `candidates`: number of places compared
+    `max_matches` places are compared, only a proportional part of it is paid. `candidates`: number of places compared
     after all places of the map are scanned in RAM (None: the technique has one stage, and compares all places).
     `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a query for the scan.
     `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`). `process_mb`: peak
@@ -90,8 +90,8 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
     most to match because every region has structure: first while a small map is filled, then with that map on disk,
     then with a large index.
 
-    Each image is matched repeatedly for about `repeat_s` seconds per map, and the least CPU time is taken, because time
-    spent in other programs is no cost of the technique. Raises ModelError if the technique fails on an image.
+    Each image is matched repeatedly for about `repeat_s` seconds per map, and the least CPU time is used, because time
+    spent in other programs is not a cost of the technique. Raises ModelError if the technique fails on an image.
     """
     bench = _Bench(technique, meter or QueryMeter(load_board("this")), repeat_s)
     spec, candidates = technique.spec, technique.candidates
@@ -104,17 +104,18 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
         process_mb = machine.read_peak_mb() if peak_is_new else machine.read_rss_mb()
         large_index = _repeat_places(technique, index)
         factor = compute_candidate_factor(bool(spec.height_ratios), len(large_index))
-        most, fewer = round(candidates / factor), round(max(spec.max_matches or 1, candidates // 2) / factor)
-        large = bench.try_map(trial_map, large_index, most)
-        half = bench.try_map(trial_map, large_index, fewer) if spec.max_matches else large
+        full_count = round(candidates / factor)
+        half_count = round(max(spec.max_matches or 1, candidates // 2) / factor)
+        large = bench.try_map(trial_map, large_index, full_count)
+        half = bench.try_map(trial_map, large_index, half_count) if spec.max_matches else large
     scan_once = _find_least([steps.scan for steps in small]) if spec.fine else NO_COST
-    # With six places, the time of a scan is query preparation and call overhead only.
+    # With six places, a scan consists only of query preparation and call overhead.
     scan_per_place = _subtract(_find_least([steps.scan if spec.fine else steps.match for steps in large]), scan_once)
     scan_per_place *= 1 / len(large_index)
     full_compare, half_compare = (_find_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.max_matches:
-        match_per_place = _subtract(full_compare, half_compare) * (1 / max(1, factor * (most - fewer)))
-        # Only an accepted query is verified: here, the noise image that is in the map.
+        match_per_place = _subtract(full_compare, half_compare) * (1 / max(1, factor * (full_count - half_count)))
+        # Only an accepted query is verified: here, that of the noise image in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
         compare_once = _subtract(full_compare, match_per_place * candidates) + verify
     else:
@@ -143,7 +144,7 @@ class _Bench:
     def __init__(self, technique: Technique, meter: QueryMeter, repeat_s: float) -> None:
         self.sequence = technique.spec.sequence
         self._technique, self._meter, self._repeat_s = technique, meter, repeat_s
-        rng = Random(0)  # NumPy's generator would load 2.5 MB that a flight needs for nothing else
+        rng = Random(0)  # NumPy's generator would load 2.5 MB that a flight does not need
         pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_TRIAL_PICTURES)]
         self._images = [picture.reshape(480, 640) for picture in pictures]
 
@@ -209,7 +210,7 @@ def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
 
 
 def _subtract(cost: StageCost, part: StageCost) -> StageCost:
-    """Return `cost` minus `part`, but at least a thousandth of `cost`, because clocks are not exact."""
+    """Return `cost` minus `part`, but at least a thousandth of `cost`, because clocks are inexact."""
     least = cost * 0.001
     return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))
 

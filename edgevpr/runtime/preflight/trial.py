@@ -1,4 +1,4 @@
-"""Trials of techniques. All forms of a technique run in one child process of its own, so that memory that one technique
+"""Trials of techniques. All forms of a technique run in the same child process, so that memory that one technique
 has loaded is not counted for another, and a library that crashes on this processor fails only its own trials."""
 
 import ctypes
@@ -44,9 +44,9 @@ class Trial:
 
 
 def list_trials(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Trial, ...]:
-    """Return the trials to run: one for each form of each technique of `names`, or one for a technique that has no
-    forms or whose settings name one. `settings`: by technique name. Raises UsageError for an unknown name, ModelError
-    for an incomplete model card."""
+    """Return the trials to run: one for each form of each technique in `names`, or one for a technique that has no
+    forms or whose settings contain one. `settings`: by technique name. Raises UsageError for an unknown name,
+    ModelError for an incomplete model card."""
     trials = []
     for name in names:
         chosen = dict((settings or {}).get(name, {}))
@@ -67,12 +67,12 @@ def run_trials(trials: Sequence[Trial], threads: int) -> Iterator[Trial]:
             except EdgevprError as error:
                 yield replace(variants[0], label=name, problem=str(error))
             except BrokenProcessPool:
-                problem = f"The trial of {name} crashed: memory ran out, or a library does not support this processor."
+                problem = f"The trial of {name} crashed: out of memory, or a library does not support this processor."
                 yield replace(variants[0], label=name, problem=problem)
 
 
 def _begin_child(parent_pid: int) -> None:
-    """Make the kernel kill this process whenever its parent exits, even if a library is stuck in an endless loop. Exits
+    """Make the kernel kill this process when its parent exits, even if a library is stuck in an endless loop. Exits
     at once if the parent has already exited."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:

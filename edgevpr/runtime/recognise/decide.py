@@ -38,13 +38,7 @@ from edgevpr.runtime.recognise.evidence import (
     log_share,
 )
 from edgevpr.runtime.recognise.hints import Hints
-from edgevpr.runtime.recognise.judge import (
-    AcceptRule,
-    Findings,
-    Verdict,
-    is_unshifted,
-    judge,
-)
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, Verdict, is_unshifted, judge
 from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, QUERY_LANDMARKS, Landmarks, unpack_bytes
 from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, add_tilt_covariance, locate, locate_at_place
 from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt

@@ -255,10 +255,7 @@ def parse_known_fields(text: str | None) -> tuple[str, ...]:
 
 
 def explain_why_unusable(
-    known: Collection[str],
-    queries: Collection[GeoTag],
-    places: Collection[GeoTag] | Collection[Place],
-    sequence: int,
+    known: Collection[str], queries: Collection[GeoTag], places: Collection[GeoTag] | Collection[Place], sequence: int
 ) -> str | None:
     """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if any query can.
     `sequence` is the number of queries that are matched together."""

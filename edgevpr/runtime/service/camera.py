@@ -26,7 +26,7 @@ _LIBCAMERA_DEVICES = ("media*", "video*", "dma_heap/*")  # below /dev
 
 
 def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
-    """Check the device or program that a live source is read through. Other sources yield no finding. `root`: root of
+    """Check the device or program that reads a live source. Other sources yield no finding. `root`: root of
     the file system that contains /dev."""
     if uri.startswith("/dev/"):
         yield check_device("camera", uri, root)

@@ -28,7 +28,7 @@ from edgevpr.runtime.service.doctor import explain_silence
 from edgevpr.runtime.service.finding import Finding, check_log, report_error, report_fault, report_ok, run_check
 from edgevpr.runtime.service.findingcodes import FindingCode
 
-_FRAME_SIZE_PX = 640, 480  # of the image with which a query is measured, if no lens calibration gives its size
+_FRAME_SIZE_PX = 640, 480  # of the image with which a query is measured, unless a lens calibration has its size
 
 
 def check_configuration(config_path: str | Path, *, offline: bool = False) -> list[Finding]:

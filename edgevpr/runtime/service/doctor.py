@@ -1,4 +1,4 @@
-"""`edgevpr doctor`: checks whether flight controller and board are set up for edgevpr. It changes neither."""
+"""`edgevpr doctor`: checks whether flight controller and board are set up for edgevpr, without changing them."""
 
 from collections.abc import Iterable, Iterator
 
@@ -18,7 +18,7 @@ from edgevpr.runtime.service.findingcodes import FindingCode
 from edgevpr.runtime.service.rules import RULES
 
 _MAX_ROUND_TRIP_S = 0.25  # a slow link delays fixes too
-_MAX_BAD_BYTES = 300  # the remainder of one or two messages at the start is normal
+_MAX_BAD_BYTES = 300  # the rest of one or two messages at the start is normal
 _NEEDED_MESSAGES = ("GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT")
 _MAX_CLOCK_DIFFERENCE_S = 60.0
 _GPS_FIX_TYPE_3D = 3
@@ -26,8 +26,8 @@ _GPS_FIX_TYPE_3D = 3
 
 def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], AutopilotReading | None]:
     """Check the autopilot at the other end of the link `address`, and this machine. Return the findings and the
-    autopilot's reading (None: nothing could be read). Raises ConfigError for an unknown board or a signing key that
-    cannot be used."""
+    values read from the autopilot (None: nothing was read). Raises ConfigError for an unknown board or a signing key
+    that is unusable."""
     settings, source = config.mavlink, config.source
     signing = open_signing(settings, is_read_only=True)
     machine_findings = list(check_machine(load_board(config.board), config.log, address))
@@ -53,23 +53,23 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
 
 
 def explain_silence(address: LinkAddress, link: RequestLink) -> Finding:
-    """Return the finding that explains, from what was received instead, why no autopilot heartbeat was received."""
-    where = str(address)
+    """Return the finding that explains why no autopilot heartbeat was received, from what was received instead."""
+    url = str(address)
     if refused := link.signing.refused:
         cause = max(refused, key=lambda reason: refused[reason])
         return report_fault(
-            "link", FindingCode.MESSAGES_REFUSED, address=where, cause=cause, meaning=REFUSAL_MEANINGS[cause]
+            "link", FindingCode.MESSAGES_REFUSED, address=url, cause=cause, meaning=REFUSAL_MEANINGS[cause]
         )
     if link.other_systems:
         change = f"mavlink: {{system_id: {min(link.other_systems)}}}"
         return report_fault(
-            "link", FindingCode.OTHER_SYSTEM, change, address=where, systems=_join_numbers(sorted(link.other_systems))
+            "link", FindingCode.OTHER_SYSTEM, change, address=url, systems=_join_numbers(sorted(link.other_systems))
         )
     if address.kind != "serial":
-        return report_fault("link", FindingCode.NO_HEARTBEAT, address=where, waited_s=HEARTBEAT_TIMEOUT_S)
+        return report_fault("link", FindingCode.NO_HEARTBEAT, address=url, waited_s=HEARTBEAT_TIMEOUT_S)
     code = FindingCode.SERIAL_NOT_MAVLINK if link.reader.bad_bytes else FindingCode.SERIAL_SILENT
     changes = (f"{rules.name}: {', '.join(rules.port_changes(address.number))}" for rules in RULES.values())
-    return report_fault("link", code, *changes, address=where, waited_s=HEARTBEAT_TIMEOUT_S)
+    return report_fault("link", code, *changes, address=url, waited_s=HEARTBEAT_TIMEOUT_S)
 
 
 def check_autopilot(reading: AutopilotReading, address: LinkAddress, sends_fixes: bool) -> Iterator[Finding]:
@@ -161,8 +161,8 @@ def _check_filter(reading: AutopilotReading) -> Finding:
     is_lost = flags & mavlink.EKF_CONST_POS_MODE and reading.firmware != "px4"
     if flags & mavlink.EKF_ATTITUDE and flags & mavlink.EKF_POS_HORIZ_ABS and not is_lost:
         return report_ok("filter", FindingCode.FILTER_READY, flags=flags)
-    lacks = "position" if flags & mavlink.EKF_ATTITUDE else "attitude"
-    return report_fault("filter", FindingCode.FILTER_NOT_READY, lacks=lacks, flags=flags)
+    missing = "position" if flags & mavlink.EKF_ATTITUDE else "attitude"
+    return report_fault("filter", FindingCode.FILTER_NOT_READY, lacks=missing, flags=flags)
 
 
 def _join_numbers(numbers: Iterable[int]) -> str:

@@ -19,8 +19,8 @@ from edgevpr.power import machine
 from edgevpr.power.boards import Board
 from edgevpr.runtime.service.findingcodes import FindingCode
 
-MIN_LOG_SPACE_MB = 10  # some hours of queries
-_SYSTEM_GROUPS = ("root", "tty")  # no user belongs here: a login shell holds the device, or a udev rule is missing
+MIN_LOG_SPACE_MB = 10  # a few hours of queries
+_SYSTEM_GROUPS = ("root", "tty")  # users are not members: a login shell uses the device, or a udev rule is missing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,11 +82,11 @@ def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
 def check_machine(
     board: Board, log: LogConfig, address: LinkAddress | None, root: Path = Path("/")
 ) -> Iterator[Finding]:
-    """Check memory, serial port and log disk of this machine for a flight as `board`. `address`: the MAVLink link
-    (None: no link). `root`: root of the file system that contains /proc, /sys and /dev."""
+    """Check this machine's memory, serial port and log disk against the needs of a flight with the profile `board`.
+    `address`: the MAVLink link (None: no link). `root`: root of the file system that contains /proc, /sys and /dev."""
     yield _check_memory(board.memory_max_mb, root)
     if address and address.kind == "serial":
-        yield check_device("serial", address.where, root)
+        yield check_device("serial", address.target, root)
     yield run_check("log", lambda what: check_log(what, log.path))
 
 
@@ -125,7 +125,7 @@ def check_log(what: str, file: str | None) -> Finding:
     """Check that the flight log `file` can be written (None or empty: no log is configured)."""
     if not file:
         return report_ok(what, FindingCode.NO_LOG)
-    # Do not open the log for this check: run by root, that would create a file that the service cannot write.
+    # Do not open the log for this check: as root, this would create a file that the service cannot write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
         return report_fault(what, FindingCode.LOG_NOT_A_FILE, path=str(path))

@@ -78,7 +78,7 @@ class FindingCode(Code):
     MAVLINK_1 = "the autopilot sends MAVLink 1, which supports neither signing nor the position messages"
     SIGNED = "on in both directions"
     UNSIGNED = "off: anyone on this link can send commands"
-    KEY_NEEDED = "the autopilot signs and ignores unsigned requests: give its key as `mavlink: {{signing_key: FILE}}`"
+    KEY_NEEDED = "the autopilot signs and ignores unsigned requests: set its key as `mavlink: {{signing_key: FILE}}`"
 
     # The autopilot
     FIRMWARE_KNOWN = "{firmware} {version}, {vehicle}"
@@ -88,7 +88,7 @@ class FindingCode(Code):
     NOT_CARRIED = (
         "no sensor tracks the position of this {vehicle} between fixes, so without GPS its failsafe acts in seconds: ",
         "set up continuous positions",
-        " in place of the receiver of type {receiver_type:g}",
+        " instead of the receiver of type {receiver_type:g}",
         ", unless another system on board sends ODOMETRY ({parameter} is {value:g})",
         "; then reboot the autopilot",
     )
@@ -100,9 +100,9 @@ class FindingCode(Code):
     PARAMETERS_RIGHT = "all parameters that affect positions from edgevpr are correct"
     STREAMS_RECEIVED = "receiving position, attitude and GPS"
     STREAMS_MISSING = "no {missing} received, even on request: the autopilot may send it only after a GPS fix"
-    FILTER_READY = "has attitude and position (flags 0x{flags:x})"
-    FILTER_NOT_READY = "the filter has no {lacks} yet (flags 0x{flags:x}): wait outdoors with the aircraft stationary"
-    FILTER_UNKNOWN = "the autopilot does not report the state of its filter"
+    FILTER_READY = "the EKF has attitude and position (flags 0x{flags:x})"
+    FILTER_NOT_READY = "the EKF has no {lacks} yet (flags 0x{flags:x}): wait outdoors with the aircraft stationary"
+    FILTER_UNKNOWN = "the autopilot does not report the state of its EKF"
     GPS_FIX = "fix type {types}"
     NO_GPS_FIX = "no GPS receiver has a fix: wait for one before take-off, so that the start position is known"
     ORIGIN_KNOWN = "{lat_deg:.6f}, {lon_deg:.6f}"
@@ -111,7 +111,7 @@ class FindingCode(Code):
         "the autopilot's clock differs from the board's by {ahead_s:+.0f} s: ",
         "set the board's clock, otherwise log times and signatures will be wrong",
     )
-    CLOCK_NOT_COMPARED = "not compared: the autopilot does not know the time of day yet"
+    CLOCK_NOT_COMPARED = "not compared: the autopilot does not know the UTC time yet"
 
     def __init__(self, *parts: str) -> None:
         super().__init__("", *parts)

@@ -16,7 +16,7 @@ from edgevpr.mavlink.requestlink import AutopilotReading
 from edgevpr.runtime.service.finding import Finding, report_fault, report_ok
 from edgevpr.runtime.service.findingcodes import FindingCode
 
-_AUTO_SWITCH_VALUES = (1, 4)  # values of GPS_AUTO_SWITCH that use the other receiver if the first has no fix
+_AUTO_SWITCH_VALUES = (1, 4)  # values of GPS_AUTO_SWITCH that select the other receiver if the first has no fix
 _VELOCITY_SOURCES = tuple(f"EK3_SRC{number}_VELXY" for number in (1, 2, 3))
 _SOURCE_OPTICAL_FLOW = 5
 
@@ -61,7 +61,7 @@ def _check_parameters(table: ParameterTable, choice: ChannelChoice, reading: Aut
 
 
 def _check_single_fixes(choice: ChannelChoice, reading: AutopilotReading, sends_fixes: bool) -> Finding:
-    """Check the use of command 43003. It sends single fixes, so the autopilot must track its position between them by
+    """Check the use of command 43003. It sends single fixes, so the autopilot must track its position between them with
     another sensor, such as airspeed or optical flow."""
     parameters = reading.parameters
     hovers = parameters.get("Q_ENABLE") == 1  # only planes have this parameter, whatever type the heartbeat reports
