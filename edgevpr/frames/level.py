@@ -24,7 +24,7 @@ MAX_TILT_UNLEVELLED_DEG = 20.0
 # Rays, (right, down, 1) in focal lengths, with a smaller down component are ignored: they show distant ground or sky.
 _MIN_RAY_DOWN = 0.1
 # Standard deviations of a reported tilt, and of one known only from the camera's mount; both as tangents.
-_REPORTED_TILT_SD = math.tan(math.radians(1.0))
+REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
 # Smaller corrections do not affect matches.
 _MIN_TILT_DEG = 1.0
@@ -314,7 +314,7 @@ class _CameraGeometry:
         if not self.is_tilt_known:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px
-        tilt_gain_sd = _REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
+        tilt_gain_sd = REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
         return float(focal * tilt_gain_sd)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Position, Vehicle
+from edgevpr.frames.level import REPORTED_TILT_SD
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2
 from edgevpr.runtime.recognise.locate import covariance_matrix
 from edgevpr.runtime.recognise.odometry import OdometryStep
@@ -16,10 +17,9 @@ from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviation of a reported attitude, as a tangent: half a degree, which a filter averages over many frames. The
-# GPS watch allows twice as much: after a false alarm GPS is not used, and successive matches in one turn have
-# the same error.
+# GPS watch allows twice as much (REPORTED_TILT_SD): after a false alarm GPS is not used, and successive matches in one
+# turn have the same error.
 ATTITUDE_SD = math.tan(math.radians(0.5))
-CAUTIOUS_ATTITUDE_SD = math.tan(math.radians(1.0))
 RECEIVER_LAG_SD_S = 0.1  # standard deviation of a receiver's lag, whose mean is `receivers.RECEIVER_LAG_S`
 _UNKNOWN_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
 _UNKNOWN_SPEED_M_S = 15.0  # assumed if the aircraft reports none
@@ -113,7 +113,7 @@ def measure_for_gps(event: Recognition, vehicle: Vehicle) -> PositionedMatch | N
     if event.frame is None:
         return None
     t_sd_s = math.hypot(RECEIVER_LAG_SD_S, event.frame.t_sd_s)
-    sd_m = picture_error_m(vehicle, vehicle.height_m or 0.0, t_sd_s, CAUTIOUS_ATTITUDE_SD)
+    sd_m = picture_error_m(vehicle, vehicle.height_m or 0.0, t_sd_s, REPORTED_TILT_SD)
     return position_match(event, FrameMeasurement(t_s=event.frame.t_mono_s, sd_m=sd_m))
 
 
@@ -126,13 +126,11 @@ def picture_error_m(
     return math.hypot(attitude_sd * height_m, t_sd_s * speed_m_s)
 
 
-def flown_accuracy_m(event: Recognition, vehicle: Vehicle, frame: FrameMeasurement, attitude_sd: float) -> float:
-    """Return the accuracy to report for the match of an event: that of the match, and the errors of the attitude (a
-    tangent) and the time of its frame."""
-    height_m, t_sd_s = frame.attitude_gain_s2 * GRAVITY_M_S2, event.frame.t_sd_s if event.frame else 0.0
-    sweep_m_s = height_m * math.radians(vehicle.tilt_rate_deg_s)
-    error_m = picture_error_m(vehicle, height_m, t_sd_s, max(ATTITUDE_SD, attitude_sd), sweep_m_s)
-    return math.hypot(event.accuracy_m or 0.0, error_m)
+def add_frame_error(match_m: float, event: Recognition, vehicle: Vehicle, height_m: float, attitude_sd: float) -> float:
+    """Return the accuracy (metres) to report for the match of an event: `match_m`, of match and map, and the errors of
+    the attitude (a tangent; no effect at a `height_m` of 0) and the time of its frame."""
+    t_sd_s, sweep_m_s = event.frame.t_sd_s if event.frame else 0.0, height_m * math.radians(vehicle.tilt_rate_deg_s)
+    return math.hypot(match_m, picture_error_m(vehicle, height_m, t_sd_s, max(ATTITUDE_SD, attitude_sd), sweep_m_s))
 
 
 def shared_time_error_m(event: Recognition, vehicle: Vehicle | None) -> float:

@@ -17,10 +17,10 @@ from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import AgeWatch
 from edgevpr.runtime.flight.consistency import Consistency
-from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4, Drift
+from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
-    flown_accuracy_m,
+    add_frame_error,
     measure_frame,
     position_match,
     shared_time_error_m,
@@ -156,10 +156,11 @@ class Navigator(Listener):
     def report_accuracy(self, event: Recognition) -> Recognition:
         """Return an event with the accuracy of its match in flight, which includes the errors of attitude and time."""
         frame, vehicle = self._measure(event), event.vehicle or self._vehicle
-        if frame is None or vehicle is None or event.accuracy_m is None:
+        if frame is None or vehicle is None or event.located is None:
             return event
-        attitude_sd = self._navigation.attitude_error_sd
-        return replace(event, accuracy_m=flown_accuracy_m(event, vehicle, frame, attitude_sd))
+        match_m, height_m = max(self._map_sd_m, event.located.accuracy_m), frame.attitude_gain_s2 * GRAVITY_M_S2
+        accuracy_m = add_frame_error(match_m, event, vehicle, height_m, self._navigation.attitude_error_sd)
+        return replace(event, accuracy_m=accuracy_m)
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Process an accepted match, and advise what to send for it. Raises ValueError for an invalid position."""

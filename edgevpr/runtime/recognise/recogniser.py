@@ -6,13 +6,14 @@ take several, at different heights.
 """
 
 import logging
+import math
 from dataclasses import replace
 from itertools import islice
 
 from edgevpr.core.contract import Descriptor, find_nearest_height
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.level import Mount, View
+from edgevpr.frames.level import REPORTED_TILT_SD, Mount, View
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import Ranking, merge_rankings
@@ -23,6 +24,7 @@ from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explai
 from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.judge import Verdict, check_texture
 from edgevpr.runtime.recognise.levelling import set_picture_heading
+from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.odometry import OdometryStep, VisualOdometry
 from edgevpr.runtime.recognise.perspective import CommonTilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
@@ -164,10 +166,15 @@ class Recogniser:
             map_lost=isinstance(failure, MapError) and not isinstance(failure, PlaceError),
             left_out=left_out,
             located=located,
-            accuracy_m=max(self._settings.min_accuracy_m, located.accuracy_m) if located else None,
+            accuracy_m=self._compute_accuracy_m(located, query.view) if located and query else None,
             steps=self.meter.steps(),
             cost=self.meter.cost(),
         )
+
+    def _compute_accuracy_m(self, located: Located, view: View) -> float:
+        """Return the accuracy of a position in the world: with errors of the map and of the reported tilt."""
+        tilt_m = REPORTED_TILT_SD * (located.height_m or 0.0) if view.is_tilt_known else 0.0
+        return max(self._settings.min_accuracy_m, math.hypot(located.accuracy_m, tilt_m))
 
     @property
     def _scale(self) -> float:

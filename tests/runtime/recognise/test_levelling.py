@@ -325,3 +325,10 @@ def test_a_picture_is_enlarged_around_its_middle(zoom):
     if zoom < 1:
         assert picture.mask.mean() == pytest.approx(zoom**2, rel=0.05)
         assert not picture.mask[0].any()
+
+
+@pytest.mark.slow
+def test_the_accuracy_in_the_world_contains_an_error_of_the_reported_tilt(walk, ground):
+    event = walk(scaling()).step(frame(ground, 1, told=STRAIGHT))
+    assert recognised(event, 1)
+    assert event.accuracy_m == pytest.approx(math.hypot(event.located.accuracy_m, 0.01746 * HEIGHT_M), rel=0.05)
