@@ -55,71 +55,71 @@ LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are not in the folder of the documents."""
-    for source, page in (PAGES | results()).items():
+    for source, page in (PAGES | list_results()).items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
-    files.append(File.generated(config, "results/index.md", content=contents_of_results()))
-    files.append(File.generated(config, "reference/configuration.md", content=configuration()))
-    files.append(File.generated(config, "reference/parameters.md", content=parameters()))
-    files.append(File.generated(config, "reference/command-line.md", content=commands()))
-    files.append(File.generated(config, "reference/json-output.md", content=json_output()))
-    files.append(File.generated(config, "reference/reasons.md", content=reasons()))
+    files.append(File.generated(config, "results/index.md", content=render_results_index()))
+    files.append(File.generated(config, "reference/configuration.md", content=render_configuration()))
+    files.append(File.generated(config, "reference/parameters.md", content=render_parameters()))
+    files.append(File.generated(config, "reference/command-line.md", content=render_commands()))
+    files.append(File.generated(config, "reference/json-output.md", content=render_json_output()))
+    files.append(File.generated(config, "reference/reasons.md", content=render_reasons()))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Turn links between files of the repository into links between pages of the site."""
-    of_page = {page: source for source, page in (PAGES | results()).items()}
-    source = of_page.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    sources = {page: source for source, page in (PAGES | list_results()).items()}
+    source = sources.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
-    def linked(link: re.Match[str]) -> str:
+    def replace_link(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[1]))
-        shown = PAGES.get(target) or results().get(target)
+        page_path = PAGES.get(target) or list_results().get(target)
         if target == RESULTS:
-            shown = "results/index.md"
+            page_path = "results/index.md"
         if target.startswith("docs/"):
-            shown = target.removeprefix("docs/")
-        if shown is None:
+            page_path = target.removeprefix("docs/")
+        if page_path is None:
             if not (ROOT / target).exists():
                 raise FileNotFoundError(f"{source}: {link[1]} does not exist")
             return f"]({config.repo_url}/blob/main/{target}{link[2] or ''})"
-        return f"]({posixpath.relpath(shown, posixpath.dirname(page.file.src_uri) or '.')}{link[2] or ''})"
+        return f"]({posixpath.relpath(page_path, posixpath.dirname(page.file.src_uri) or '.')}{link[2] or ''})"
 
-    return LINK.sub(linked, markdown)
+    return LINK.sub(replace_link, markdown)
 
 
-def results() -> dict[str, str]:
+def list_results() -> dict[str, str]:
     """Return the page (or picture) of the site for every page and picture of the results."""
     kinds = (".md", ".png", ".jpg", ".webp")
-    found = sorted(path.name for path in (ROOT / RESULTS).iterdir() if path.suffix in kinds)
-    return {f"{RESULTS}/{name}": f"results/{name}" for name in found}
+    names = sorted(path.name for path in (ROOT / RESULTS).iterdir() if path.suffix in kinds)
+    return {f"{RESULTS}/{name}": f"results/{name}" for name in names}
 
 
-def contents_of_results() -> str:
+def render_results_index() -> str:
     """Return a page that lists the pages of results by their titles."""
     lines = ["# All results", "", "Each page names the command and the machine that produced it.", ""]
-    for source, page in results().items():
+    for source, page in list_results().items():
         if source.endswith(".md"):
             title = re.search(r"^# (.+)$", (ROOT / source).read_text("utf-8"), re.M)
             lines.append(f"* [{title[1] if title else page}]({posixpath.basename(page)})")
     return "\n".join(lines) + "\n"
 
 
-def configuration() -> str:
+def render_configuration() -> str:
     """Return the page of the configuration, with the text of `deploy/config.yaml` and the types of the code."""
     lines = ["# Configuration", "", "Generated from `deploy/config.yaml` and `edgevpr/core/config.py`."]
     text, comment, section = (ROOT / "deploy/config.yaml").read_text("utf-8"), [], ""
     keys = {key.name: key for key in list_keys(Config)}
     for line in text.splitlines():
-        if found := re.match(r"( *)# ?(.*)", line):
-            comment.append(found[2])
+        if match := re.match(r"( *)# ?(.*)", line):
+            comment.append(match[2])
             continue
-        if found := re.match(r"( *)(\w+): *(.*)", line):
-            name = f"{section}.{found[2]}" if found[1] else found[2]
-            if not found[3]:
-                section = found[2]
+        if match := re.match(r"( *)(\w+): *(.*)", line):
+            name = f"{section}.{match[2]}" if match[1] else match[2]
+            if not match[3]:
+                section = match[2]
                 lines += ["", f"## {section}", "", *comment]
             else:
-                facts = [details(key, found[3]) for key in keys.values() if f"{key.name}.".startswith(f"{name}.")]
+                facts = [describe_key(key, match[3]) for key in keys.values() if f"{key.name}.".startswith(f"{name}.")]
                 lines += ["", f"### `{name}`", "", *facts, "", *comment]
         elif comment and not line.strip():
             lines += ["", *comment]
@@ -127,7 +127,7 @@ def configuration() -> str:
     return "\n".join(lines) + "\n"
 
 
-def details(key: Key, default: str) -> str:
+def describe_key(key: Key, default: str) -> str:
     """Return type, default, limits and flag of a key."""
     facts = [KINDS[key.kind], f"default `{default}`"]
     if key.limits:
@@ -137,7 +137,7 @@ def details(key: Key, default: str) -> str:
     return f"*{'; '.join(facts)}*"
 
 
-def parameters() -> str:
+def render_parameters() -> str:
     """Return the page of the autopilot's parameters, made from the table that `run` and `doctor` use."""
     lines = ["# Parameters of the autopilot", "", PARAMETERS_INTRODUCTION]
     for table in TABLES.values():
@@ -151,15 +151,16 @@ def parameters() -> str:
     return "\n".join(lines) + "\n"
 
 
-def commands() -> str:
+def render_commands() -> str:
     """Return the page of the command line: every command with its usage and its flags."""
     lines = ["# Command line", "", "Generated from the program's help. `--debug` shows the traceback of an error.", ""]
     lines += ["## Exit codes", "", "| code | meaning |", "|---|---|"]
     lines += [*(f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()), ""]
-    for parser in parsers(make_parser()):
+    for parser in list_parsers(make_parser()):
         lines += [f"## {parser.prog}", "", parser.description or "", ""]
         lines += ["```text", re.sub(r"^usage: ", "", parser.format_usage()).rstrip(), "```", ""]
-        rows = [(named(each), each.help) for each in parser._actions if each.help not in (None, argparse.SUPPRESS)]
+        actions = [action for action in parser._actions if action.help not in (None, argparse.SUPPRESS)]
+        rows = [(format_argument(action), action.help) for action in actions]
         rows = [(name, text) for name, text in rows if name and not name.startswith("`-h`")]
         if rows:
             lines += ["| argument | meaning |", "|---|---|"]
@@ -168,7 +169,7 @@ def commands() -> str:
     return "\n".join(lines)
 
 
-def json_output() -> str:
+def render_json_output() -> str:
     """Return the page of the output of `--json`, made from its schema."""
     path = "docs/reference/json-output.yaml"
     schema = yaml.safe_load((ROOT / path).read_text("utf-8"))
@@ -180,11 +181,11 @@ def json_output() -> str:
     ]
     for name, part in schema["$defs"].items():
         lines += ["", f"## {name}", "", part.get("description", ""), "", "| field | type | meaning |", "|---|---|---|"]
-        lines += [f"| {field} | {kind} | {text} |" for field, kind, text in fields_of(part, "")]
+        lines += [f"| {field} | {kind} | {text} |" for field, kind, text in list_fields(part, "")]
     return "\n".join(lines) + "\n"
 
 
-def reasons() -> str:
+def render_reasons() -> str:
     """Return the page of the reasons and findings, made from their tables."""
     lines = ["# Reasons", ""]
     lines += [
@@ -195,50 +196,50 @@ def reasons() -> str:
     ]
     lines += ["`edgevpr/core/reasons.py` and `edgevpr/runtime/service/findingcodes.py`.", ""]
     lines += ["| code | in short | sentence |", "|---|---|---|"]
-    lines += [f"| `{code.name}` | {code.summary} | {sentence_of(code)} |" for code in ReasonCode]
+    lines += [f"| `{code.name}` | {code.summary} | {format_sentence(code)} |" for code in ReasonCode]
     lines += ["", "## Findings of `check` and `doctor`", "", "Some findings have a code of the table above.", ""]
     lines += ["| code | sentence |", "|---|---|"]
-    lines += [f"| `{code.name}` | {sentence_of(code)} |" for code in FindingCode]
+    lines += [f"| `{code.name}` | {format_sentence(code)} |" for code in FindingCode]
     return "\n".join(lines) + "\n"
 
 
-def sentence_of(code: Code) -> str:
+def format_sentence(code: Code) -> str:
     """Return the sentence of a code, with the names of its parameters in braces."""
     pieces = [piece for part in code.parts for piece in Formatter().parse(part)]
     sentence = "".join(f"{text}{{{name}}}" if name else text for text, name, _, _ in pieces)
     return sentence.replace("{summary}", code.summary)
 
 
-def fields_of(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
+def list_fields(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
     """Yield field, type and meaning of all fields in a part of the schema, including those of inner objects."""
     if "$ref" in part:
         name = part["$ref"].rpartition("/")[2]
         yield f"`{prefix}*`", "", f"the fields of [{name}](#{name})"
-    for name, each in part.get("properties", {}).items():
-        kinds = each.get("type", "")
+    for name, field in part.get("properties", {}).items():
+        kinds = field.get("type", "")
         kind = " or ".join([kinds] if isinstance(kinds, str) else kinds)
-        only = f"only with {each['only']}" if str(each.get("only", "")).startswith("--") else each.get("only", "")
+        only = f"only with {field['only']}" if str(field.get("only", "")).startswith("--") else field.get("only", "")
         only = f"only if {only}" if only and not only.startswith("only") else only
-        texts = [each.get("description", ""), only, ", ".join(f"`{value}`" for value in each.get("enum", ()))]
+        texts = [field.get("description", ""), only, ", ".join(f"`{value}`" for value in field.get("enum", ()))]
         yield f"`{prefix}{name}`", kind, "; ".join(filter(None, texts))
-        yield from fields_of({key: each[key] for key in each.keys() - {"description"}}, f"{prefix}{name}.")
+        yield from list_fields({key: field[key] for key in field.keys() - {"description"}}, f"{prefix}{name}.")
     if isinstance(part.get("items"), dict):
-        yield from fields_of(part["items"], f"{prefix}[].")
-    for each in part.get("anyOf", ()):
-        yield from fields_of(each, prefix)
+        yield from list_fields(part["items"], f"{prefix}[].")
+    for field in part.get("anyOf", ()):
+        yield from list_fields(field, prefix)
 
 
-def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+def list_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     """Yield the parsers of all commands that can be run, depth first."""
-    inner = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
-    if not inner:
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not groups:
         yield parser
-    for each in inner:
-        for command in each.choices.values():
-            yield from parsers(command)
+    for group in groups:
+        for command in group.choices.values():
+            yield from list_parsers(command)
 
 
-def named(action: argparse.Action) -> str:
+def format_argument(action: argparse.Action) -> str:
     """Return the notation of an argument: its flags and its placeholder."""
     if isinstance(action, argparse._SubParsersAction):
         return ""
