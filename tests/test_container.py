@@ -48,7 +48,7 @@ def test_dockerfile_copies_enough_for_the_wheel(dockerfile, tmp_path):
     assert list(tmp_path.glob(f"dist/edgevpr-{__version__}-*.whl"))
 
 
-def test_dockerfile_flies_without_root_and_installs_nothing(dockerfile, flown):
+def test_dockerfile_runs_without_root_and_installs_nothing(dockerfile, flown):
     build, last = dockerfile.parent_images
     assert build == last, "another Python could not use the packages"
     assert flown["USER"] == "edgevpr"

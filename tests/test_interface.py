@@ -74,7 +74,7 @@ def test_map_match_returns_position_and_confidence(flight, valley):
         assert nothing.reason
 
 
-def test_map_match_uses_what_is_known(flight, valley):
+def test_map_match_uses_the_given_hints(flight, valley):
     picture = cv2.imread(str(flight / "later" / "3.jpg"))
     with edgevpr.Map(valley) as ground:
         rotation_deg = ground.match(picture).rotation_deg
@@ -115,7 +115,7 @@ def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
 
 @pytest.mark.process
 @pytest.mark.parametrize("module", ["edgevpr", "edgevpr.cli"])
-def test_import_loads_nothing_heavy_before_it_is_needed(module):
+def test_import_loads_heavy_packages_only_when_needed(module):
     code = f"import sys, {module}; print(*sys.modules); edgevpr.Map; assert 'numpy' in sys.modules"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     heavy = {"av", "cv2", "numpy", "onnxruntime", "pymavlink", "yaml", "psutil", "serial"}
@@ -141,7 +141,7 @@ def test_examples_run(flight, valley, tmp_path, script, more, said):
 
 
 @pytest.mark.process
-def test_example_of_a_film_with_subtitles(flight, tmp_path, capsys, caplog):
+def test_film_with_subtitles_example_runs(flight, tmp_path, capsys, caplog):
     (tmp_path / "images").symlink_to(flight / "mapped")
     lines = (flight / "mapped" / "positions.csv").read_text().splitlines()
     (tmp_path / "positions.csv").write_text(

@@ -12,7 +12,7 @@ AHEAD = [f"nordland_tiny/query/{number}.png" for number in ("0216", "0222", "029
 AHEAD += ["grief_stromovka_seasons/query/0055.jpg", "grief_stromovka_seasons/ref/0035.jpg"]
 
 
-def test_no_damaged_map_gives_a_traceback_or_a_wrong_position_or_loses_a_place():
+def test_run_damaged_maps_reports_no_traceback_no_wrong_position_and_no_lost_place():
     rows = hostile_maps.run(2 * len(hostile_maps.KINDS), seed=11)
     assert [row["kind"] for row in rows] == list(hostile_maps.KINDS)
     for row in rows:
@@ -20,7 +20,7 @@ def test_no_damaged_map_gives_a_traceback_or_a_wrong_position_or_loses_a_place()
 
 
 @needs_sets
-def test_a_map_made_looking_down_knows_that_a_view_ahead_is_none_of_its_places(tmp_path):
+def test_map_of_downward_images_refuses_forward_images(tmp_path):
     folder = base.DATA / "aerial_brighton"
     recogniser = hostile_pictures.mapped(folder, tmp_path)
     with recogniser.place_map:
@@ -29,7 +29,7 @@ def test_a_map_made_looking_down_knows_that_a_view_ahead_is_none_of_its_places(t
 
 
 @needs_sets
-def test_a_run_of_pictures_counts_every_kind_and_nothing_wrong_is_accepted():
+def test_run_images_counts_each_kind_and_accepts_none_wrongly():
     rows = hostile_pictures.run(count=2, seed=31, names=["corridor"])
     assert [(row["kind"], row["tried"]) for row in rows] == [
         ("of nothing", 2),

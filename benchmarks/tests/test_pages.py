@@ -40,22 +40,22 @@ def loaded(name: str):
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in BENCHMARKS.glob("*.py")))
-def test_a_script_can_be_loaded(name):
+def test_scripts_can_be_loaded(name):
     assert loaded(name).__doc__
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_a_page_is_what_its_results_say(name):
+def test_page_matches_its_results(name):
     page = (base.RESULTS / f"{name}.md").read_text("utf-8")
     assert loaded(PAGES[name]).page(base.read(name)).strip() + "\n" == page
 
 
-def test_the_page_of_the_thesis_is_what_the_results_say():
+def test_thesis_page_matches_its_results():
     page = (base.REPOSITORY / "docs" / "thesis.md").read_text("utf-8")
     assert page == thesis_page.page(thesis_values.read_results(base.RESULTS)), "python benchmarks/thesis.py --page"
 
 
-def test_the_page_of_figures_is_what_the_results_say(tmp_path):
+def test_figures_page_matches_its_results(tmp_path):
     page, copy = base.REPOSITORY / "docs" / "figures.md", tmp_path / "figures.md"
     copy.write_text(page.read_text("utf-8"), "utf-8")
     contents = sets_page.read_sets(base.RESULTS)
@@ -63,13 +63,13 @@ def test_the_page_of_figures_is_what_the_results_say(tmp_path):
     assert copy.read_text("utf-8") == page.read_text("utf-8"), "python benchmarks/figures_page.py"
 
 
-def test_a_page_names_pictures_that_are_there():
+def test_pages_link_only_existing_pictures():
     for page in base.RESULTS.glob("*.md"):
         for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text("utf-8")):
             assert (base.RESULTS / picture).is_file(), (page.name, picture)
 
 
-def test_the_counts_that_travel_are_those_of_the_benchmark():
+def test_shipped_counts_match_the_benchmark():
     parts = {row["part"]: row["instructions"] for row in base.read("arm64")["parts"]}
     assert counted.figures(parts) == json.loads(COUNTED_PATH.read_text())
 

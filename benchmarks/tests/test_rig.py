@@ -21,7 +21,7 @@ def degrees(east_m: float, north_m: float) -> tuple[float, float]:
     return at.lat_deg, at.lon_deg
 
 
-def test_the_truth_of_a_turn_between_two_states():
+def test_truth_interpolates_a_turn_between_two_states():
     """Banked by 30 degrees, the nose turns at g tan(30) / v: 14.7 degrees a second at 22 m/s."""
     roll, turn = np.radians(30.0), 9.81 * np.tan(np.radians(30.0)) / 22.0
     lat_deg, lon_deg = degrees(500.0, 300.0)
@@ -49,7 +49,7 @@ def test_the_truth_of_a_turn_between_two_states():
     assert told.at(10.5) is None  # nor of so long after
 
 
-def test_the_figures_of_a_run(tmp_path):
+def test_figures_of_a_run(tmp_path):
     """GPS is lost at 100 s; the estimate drifts at 2 m/s for ten seconds, and the pictures were taken at the truth."""
     columns = "t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode"
     lines = [f"{t:.1f},500,300,500,300,{2 * max(t - 100, 0):.2f},10" for t in np.arange(95, 110.05, 0.1)]
@@ -97,6 +97,6 @@ def test_the_figures_of_a_run(tmp_path):
     assert found["answers"] == {"ACCEPTED": 2}
 
 
-def test_worse_than_without_at_the_worst_second():
+def test_worse_than_without_compares_the_worst_seconds():
     assert figures.worse_by(np.array([1.0, 5.0, 2.0]), np.array([2.0, 1.0, 9.0, 20.0])) == (4.0, 1)
     assert to_metres(*degrees(12.0, 34.0)) == pytest.approx((12.0, 34.0), abs=1e-6)

@@ -24,7 +24,7 @@ def make_set(folder, places=4):
     (folder / "ground_truth.csv").write_text("\n".join(truth))
 
 
-def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
+def test_measure_writes_one_file_per_set_and_its_summary_lines(tmp_path):
     make_set(tmp_path / "data" / "meadow")
     make_set(tmp_path / "data" / "grief_stromovka_monthly", places=1)  # one of those that are left out
     for variants in ("hog;cohog", "seqslam"):  # the second adds to what the first has written
@@ -44,7 +44,7 @@ def test_every_set_gets_a_file_and_its_lines_in_the_summary(tmp_path):
     assert "* grief_stromovka_monthly: five places only" in page
 
 
-def test_a_set_of_sites_gets_positions_and_what_is_known_is_measured_where_there_are_headings(tmp_path):
+def test_measure_places_site_sets_and_measures_known_headings(tmp_path):
     make_set(tmp_path / "data" / "meadow")
     make_set(tmp_path / "data" / "sat_town")
     rows = [f"{side}{n}.png,{'ab'[n // 2]},1,{240 * n},90,0" for side in ("query", "ref") for n in range(4)]

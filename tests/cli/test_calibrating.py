@@ -66,7 +66,7 @@ def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
 
-def test_map_build_makes_a_map_that_it_cannot_calibrate(flight, tmp_path, capsys, monkeypatch):
+def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES + 1)
     assert built(tmp_path / "small.gpkg", flight / "ref") == 0
     said = capsys.readouterr()

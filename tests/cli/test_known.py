@@ -45,7 +45,7 @@ def test_eval_with_known_headings_rules_out_other_rotations(capsys, tmp_path):
     assert (told["known"], told["accepted"], told["accepted_wrong"]) == ("heading", 3, 0)
 
 
-def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
+def test_match_reports_the_hints_of_each_query(capsys, tmp_path):
     folder = make(tmp_path / "set", rotation_deg=(0, 0, 0, 90, 90, None))
     path = tmp_path / "m.gpkg"
     build = ("map", "build", path, "--images", folder / "ref", "--technique", "cohog", "--camera", "nadir")
@@ -70,6 +70,6 @@ def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
         ("height", True, ("--sequence", "2"), "2 queries are matched together"),
     ],
 )
-def test_eval_refuses_what_cannot_be_known(capsys, tmp_path, known, places_known, more, said):
+def test_eval_refuses_known_data_that_is_missing(capsys, tmp_path, known, places_known, more, said):
     folder = make(tmp_path / "set", places_known=places_known)
     assert said in refused(capsys, "eval", "--data", folder, "--techniques", "cohog", "--known", known, *more)

@@ -43,7 +43,7 @@ DAMAGE = (
 )
 
 
-def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
+def test_map_repair_leaves_an_intact_map_unchanged(valley, capsys):
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 0
     said = capsys.readouterr()
@@ -56,7 +56,7 @@ def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 
 
-def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys):
+def test_map_repair_drops_damaged_places_and_keeps_the_original(valley, capsys):
     write_sql(valley, *DAMAGE)
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 1
@@ -86,7 +86,7 @@ def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys)
     assert original.read_bytes() == before
 
 
-def test_map_repair_leaves_a_map_of_which_nothing_can_be_read(valley, capsys):
+def test_map_repair_leaves_a_completely_unreadable_map_unchanged(valley, capsys):
     write_sql(valley, "UPDATE places SET coarse = x'00'")
     before = valley.read_bytes()
     assert "restore" in refused(capsys, "map", "repair", valley, code=1)

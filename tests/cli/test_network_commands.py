@@ -60,7 +60,7 @@ def test_match_refuses_a_map_of_other_weights(models, flight, capsys):
     assert "sha256" in refused(capsys, "match", path, "--images", flight / "query", code=1)
 
 
-def test_match_says_how_to_get_the_network_of_a_map(models, flight, capsys):
+def test_match_explains_how_to_get_the_network_of_a_map(models, flight, capsys):
     path = built(flight, "--technique", "tiny")
     (models / "tiny.yaml").unlink()
     assert main(["match", str(path), "--images", str(flight / "query")]) == 1

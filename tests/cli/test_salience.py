@@ -58,7 +58,7 @@ def test_salience_scores_a_picture(networks, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_map_build_leaves_out_frames_and_bounds_gaps(recording, tmp_path, capsys):
+def test_map_build_leaves_out_frames_and_limits_gaps(recording, tmp_path, capsys):
     place_map = tmp_path / "m.gpkg"
     command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
     built = run_json(capsys, *command, "--config", config(tmp_path))

@@ -33,7 +33,7 @@ def said(capfd, *words):
         ("\ud800\0", r"\ud800\x00"),
     ],
 )
-def test_escape_unprintable_escapes_what_a_terminal_acts_on(text, printed):
+def test_escape_unprintable_escapes_terminal_control_characters(text, printed):
     assert escape_unprintable(text) == printed
     printed.encode("utf-8")
 

@@ -29,7 +29,7 @@ def test_config_file_holds_the_default_of_every_key():
     assert {key.name.removesuffix(".gps").removesuffix(".no_gps") for key in list_keys()} <= explanations().keys()
 
 
-def test_config_file_says_the_limits_of_every_key():
+def test_config_file_documents_the_limits_of_every_key():
     texts, unsaid = explanations(), []
     for key in (key for key in list_keys() if key.limits):
         limits = " to ".join(f"{limit:.12g}" for limit in key.limits)
@@ -46,7 +46,7 @@ def test_load_config_puts_flags_over_the_file_over_the_defaults(tmp_path):
     assert (config.mavlink.source_sets.gps, config.map) == (1, None)
 
 
-def test_load_config_refuses_a_section_that_is_none_before_a_flag_goes_into_it(tmp_path):
+def test_load_config_refuses_an_invalid_section_before_applying_a_flag(tmp_path):
     path = tmp_path / "flight.yaml"
     path.write_text("source:\n")
     with pytest.raises(ConfigError, match="`source`"):

@@ -49,7 +49,7 @@ def parse_package():
         ),
     ],
 )
-def test_reason_is_a_sentence_without_what_is_unknown(code, parameters, sentence):
+def test_reason_sentence_omits_unknown_parameters(code, parameters, sentence):
     codes = {each.name: each for each in CODES}
     assert str(Reason(codes[code], parameters)) == sentence
 
@@ -59,7 +59,7 @@ def test_codes_are_all_different():
     assert len(set(names)) == len(names) == len(CODES), "members with equal texts would be one"
 
 
-def test_read_reason_gives_what_was_written_and_nothing_else():
+def test_read_reason_reverses_fields_and_rejects_everything_else():
     reason = Reason(ReasonCode.NOT_MEMORABLE, {"measure": "entropy", "score": 0.25, "min_score": None})
     assert read_reason(reason.fields()) == Reason(reason.code, {"measure": "entropy", "score": 0.25})
     for damaged in (None, "not memorable", 7, {"code": "GONE", "parameters": {}}, {"code": "LOW_SCORE"}):
@@ -96,7 +96,7 @@ def test_reasons_are_given_the_parameters_of_their_sentences():
     assert {code.name for code in CODES} - used == {"NOT_SEARCHED"}, "which `reasons` itself uses"
 
 
-def test_no_module_takes_a_sentence_apart():
+def test_modules_never_parse_the_sentence_of_a_reason():
     """Neither a pattern nor a method of text is applied to a reason, nor is one compared with text."""
     methods = {"startswith", "endswith", "split", "partition", "replace", "find", "match", "search", "sub", "count"}
     found = []

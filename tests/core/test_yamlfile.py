@@ -63,7 +63,7 @@ def test_read_yaml_refuses_deep_nesting(level, refused):
         (".nan", "`source.rate_hz` is nan, but must be between"),
     ],
 )
-def test_load_config_refuses_a_number_of_hundreds_of_digits(number, says, refused):
+def test_load_config_refuses_numbers_with_hundreds_of_digits(number, says, refused):
     assert says in refused(f"source: {{rate_hz: {number}}}\n", load_config)
 
 
@@ -78,7 +78,7 @@ def test_load_config_refuses_a_number_of_hundreds_of_digits(number, says, refuse
         ("m.gpkg\n? " + "k" * 50_000 + "\n: 1", "key `kkkk"),
     ],
 )
-def test_load_config_refuses_a_text_that_no_file_can_have(text, says, refused):
+def test_load_config_refuses_characters_that_no_file_name_can_have(text, says, refused):
     assert says in refused(f"map: {text}\n", load_config)
 
 

@@ -64,7 +64,7 @@ def decode_file(path: Path) -> tuple[VideoDecoder, list[av.VideoFrame]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pixel_format", ["yuv420p10le", "yuyv422", "gray16le"])
-def test_two_threads_convert_the_pictures_of_one_stream(pixel_format, tmp_path):
+def test_make_thumbnail_is_safe_in_two_threads(pixel_format, tmp_path):
     """Two threads in one converter of FFmpeg hang or crash, and take memory without end."""
     codec = "rawvideo" if pixel_format == "yuyv422" else "ffv1"
     whole, pictures = decode_file(write_video(tmp_path / "a.nut", [cv2.merge([RAMP] * 3)] * 8, pixel_format, codec))
@@ -104,7 +104,7 @@ def test_two_threads_convert_the_pictures_of_one_stream(pixel_format, tmp_path):
         ("yuvj422p", "mjpeg", 2, 3),
     ],
 )
-def test_a_ramp_of_grey_keeps_its_levels_in_every_format(pixel_format, codec, color_range, levels, tmp_path):
+def test_read_frames_keeps_a_grey_ramp_in_each_format(pixel_format, codec, color_range, levels, tmp_path):
     frame = av.VideoFrame.from_ndarray(cv2.merge([RAMP] * 3), "bgr24")
     frame = frame.reformat(format=pixel_format, src_color_range=2, dst_color_range=color_range)
     options = {"libx264": {"qp": "1"}, "libx265": {"crf": "4", "x265-params": "log-level=none"}}.get(codec, {})
@@ -114,7 +114,7 @@ def test_a_ramp_of_grey_keeps_its_levels_in_every_format(pixel_format, codec, co
     assert np.abs(image[SIZE_PX[1] // 2].astype(int) - RAMP[0][:, None]).max() <= levels
 
 
-def test_counts_are_the_same_from_a_folder_and_from_a_video(tmp_path):
+def test_read_frames_gives_equal_counts_from_a_folder_and_a_video(tmp_path):
     flight = thermal_flight()
     for index, counts in enumerate(flight):
         cv2.imwrite(str(tmp_path / f"{index}{('.png', '.tif')[index % 2]}"), counts)
@@ -135,14 +135,14 @@ def test_video_of_12_bits_of_grey_shows_its_own_range_with_square_pixels(tmp_pat
     assert image.shape == (240, 480)
 
 
-def test_coloured_image_of_16_bits_has_one_range_for_all_channels(tmp_path):
+def test_depth_range_is_common_to_all_channels_of_a_16_bit_colour_image(tmp_path):
     cv2.imwrite(str(tmp_path / "colour.png"), cv2.merge([as_counts(SCENE), as_counts(SCENE), as_counts(SCENE, 2)]))
     colour = read_image(tmp_path / "colour.png")
     assert (colour.dtype, colour.shape) == (np.uint8, (*SCENE.shape, 3))
     assert colour[..., 0].mean() > colour[..., 2].mean() + 20
 
 
-def test_a_hot_object_that_passes_leaves_the_grey_levels_of_the_ground():
+def test_depth_range_keeps_ground_levels_while_a_hot_object_passes():
     depth = DepthRange()
     before, *_ = (depth.to_8_bits(counts) for counts in thermal_flight())
     with_fire = thermal_flight()[0]
@@ -153,7 +153,7 @@ def test_a_hot_object_that_passes_leaves_the_grey_levels_of_the_ground():
     assert shown[:, 40:].std() > 0.3 * before[:, 40:].std()
 
 
-def test_a_picture_that_does_not_fit_the_range_is_shown_over_its_own():
+def test_depth_range_shows_an_image_outside_the_range_with_its_own_range():
     depth = DepthRange()
     flight = thermal_flight()
     first, *_ = (depth.to_8_bits(counts) for counts in flight)
@@ -163,14 +163,14 @@ def test_a_picture_that_does_not_fit_the_range_is_shown_over_its_own():
     assert narrow.std() > 0.8 * first.std()
 
 
-def test_noise_without_a_scene_is_not_made_a_picture():
+def test_depth_range_does_not_amplify_noise_without_a_scene():
     noise = np.random.default_rng(1).normal(8000, 2, (240, 320)).astype(np.uint16)
     assert DepthRange().to_8_bits(noise).std() < 12
     for count in (0, 65535):
         assert DepthRange().to_8_bits(np.full((240, 320), count, np.uint16)).std() == 0
 
 
-def test_coarse_copies_of_a_frozen_picture_of_counts_are_equal(tmp_path):
+def test_coarse_copies_of_a_frozen_16_bit_image_are_equal(tmp_path):
     flight = [*thermal_flight(), *[thermal_flight()[3]] * 3]
     video = [av.VideoFrame.from_ndarray(counts, "gray16le") for counts in flight]
     whole, pictures = decode_file(write_video(tmp_path / "a.nut", video, "gray16le"))
@@ -198,7 +198,7 @@ class ThermalCamera:
         return True, cv2.merge([(counts >> 8).astype(np.uint8)] * 3) if self.converts else counts
 
 
-def test_v4l2_camera_of_16_bits_shows_what_a_folder_of_its_images_does(tmp_path):
+def test_v4l2_16_bit_camera_gives_the_same_images_as_a_folder(tmp_path):
     for index, counts in enumerate(thermal_flight()):
         cv2.imwrite(str(tmp_path / f"{index}.png"), counts)
     capture = DeviceCapture(ThermalCamera(thermal_flight()), clock=lambda: 1.0)
@@ -210,9 +210,7 @@ def test_v4l2_camera_of_16_bits_shows_what_a_folder_of_its_images_does(tmp_path)
 
 @pytest.mark.parametrize("extension", [".mkv", ".ts", ".mp4"])
 @pytest.mark.parametrize(("aspect", "width_px"), [("16/11", 465), ("8/9", 284), ("200/201", 320), ("9", 320)])
-def test_pixels_that_are_not_square_are_resampled_unless_their_shape_cannot_be_right(
-    aspect, width_px, extension, tmp_path
-):
+def test_non_square_pixels_are_resampled_unless_their_ratio_is_implausible(aspect, width_px, extension, tmp_path):
     circle = np.zeros((240, 320, 3), np.uint8)
     cv2.ellipse(circle, (160, 120), (round(160 / (width_px / 320)) // 2, 80), 0, 0, 360, (255, 255, 255), -1)
     settings = {"codec": "libx264", "sample_aspect_ratio": Fraction(aspect)}
@@ -231,7 +229,7 @@ def stereo_pair(picture: np.ndarray, shift_px: int) -> tuple[np.ndarray, np.ndar
 
 @pytest.mark.parametrize("join", [np.hstack, np.vstack, lambda pair: np.hstack(pair)[:, ::2]])
 @pytest.mark.parametrize("shift_px", [1, 12])
-def test_both_pictures_of_a_stereo_camera_in_one_are_refused(join, shift_px):
+def test_stereo_check_refuses_side_by_side_images(join, shift_px):
     check = StereoCheck()
     for step in range(12):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
@@ -243,7 +241,7 @@ def test_both_pictures_of_a_stereo_camera_in_one_are_refused(join, shift_px):
     check.require_single(SCENE.astype(np.uint8))
 
 
-def test_ground_that_repeats_itself_is_not_taken_for_a_stereo_picture():
+def test_stereo_check_accepts_repetitive_ground():
     rows, columns = np.indices((240, 320))
     noise = np.random.default_rng(1).normal(0, 5, rows.shape)
     crops = 120 + 40 * np.sin((columns + 0.3 * rows) / 4)

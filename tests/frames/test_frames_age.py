@@ -54,7 +54,7 @@ def simulate_link(taken_s, sizes, bytes_per_s, rng, jitter_s=0.003):
     ("rate", "from_s"), [(0.48, 4), (0.84, 4), (0.98, 1), (0.9999, 1), (1.0001, 1), (1.05, 1), (2, 7)]
 )
 @pytest.mark.parametrize("rate_hz", [12, 25])
-def test_stamps_of_another_rate_make_no_picture_old(rate, from_s, rate_hz):
+def test_stamped_time_corrects_timestamps_of_another_rate(rate, from_s, rate_hz):
     """Three minutes, with jitter; a camera that stamps 25 pictures a second and delivers 12 has the rate 0.48."""
     rng = np.random.default_rng(1)
     taken_s = np.arange(180 * rate_hz) / rate_hz
@@ -75,7 +75,7 @@ def test_stamps_of_another_rate_make_no_picture_old(rate, from_s, rate_hz):
 
 @pytest.mark.parametrize("key_factor", [2.2, 8.0])
 @pytest.mark.parametrize(("slow", "lasts_s"), [(0.84, 20), (0.5, 4)])
-def test_congestion_makes_pictures_older_and_is_no_clock(slow, lasts_s, key_factor):
+def test_stamped_time_counts_congestion_as_age_and_not_as_clock_drift(slow, lasts_s, key_factor):
     """A link that carries 0.84 of what is sent makes the delay grow as straightly as stamps that run slow."""
     rng = np.random.default_rng(2)
     taken_s = np.arange(90 * 25) / 25
@@ -94,7 +94,7 @@ def test_congestion_makes_pictures_older_and_is_no_clock(slow, lasts_s, key_fact
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_congestion_of_a_link_that_changes_is_no_clock(seed):
+def test_stamped_time_does_not_take_changing_congestion_for_clock_drift(seed):
     """Capacities of 0.3 to 1.3 of what is sent, each for some seconds, and pictures that are nearly all of one size."""
     rng = np.random.default_rng(seed)
     taken_s = np.arange(90 * 25) / 25
@@ -105,14 +105,14 @@ def test_congestion_of_a_link_that_changes_is_no_clock(seed):
     assert np.nanmin(ages_s - (came_s - taken_s)) > -0.1, "none is said to be younger than it is"
 
 
-def test_where_congestion_and_clock_look_alike_the_age_is_unknown():
+def test_stamped_time_is_unknown_if_congestion_and_clock_drift_look_alike():
     """Pictures of equal size come at equal intervals, 0.4 s a second too late."""
     ages_s = feed_delayed(StampedTime(), 0.02 * np.arange(1200))
     assert np.nanmax(ages_s) < 0.5
     assert np.isnan(ages_s[40:]).all()
 
 
-def test_a_camera_that_runs_slow_and_then_right_is_followed():
+def test_stamped_time_follows_a_camera_whose_clock_rate_becomes_correct():
     rng = np.random.default_rng(3)
     steps_s = np.r_[np.full(12 * 30, 1 / 12), np.full(25 * 60, 1 / 25)]
     taken_s = np.cumsum(steps_s)
@@ -127,25 +127,25 @@ def test_a_camera_that_runs_slow_and_then_right_is_followed():
     assert np.isnan(ages_s[60:]).mean() < 0.05
 
 
-def test_what_a_picture_took_longer_than_the_quickest_is_its_age():
+def test_stamped_time_counts_delay_beyond_the_minimum_as_age():
     delays_s = np.where((np.arange(100) >= 60) & (np.arange(100) < 70), 0.8, 0.0)
     assert feed_delayed(StampedTime(), delays_s)[3:] == pytest.approx(delays_s[3:], abs=0.001)
 
 
-def test_pictures_that_have_waited_for_the_opening_have_no_time():
+def test_images_buffered_before_opening_have_no_time():
     """Forty pictures are there at once, the last of them new; then one comes every 50 ms."""
     ages_s = feed_delayed(StampedTime(), np.maximum(0.0, 2.0 - np.arange(80) * STEP_S))
     assert np.isnan(ages_s[:40]).all()
     assert ages_s[50:] == pytest.approx(np.zeros(30), abs=0.001)
 
 
-def test_no_picture_is_taken_after_it_has_arrived():
+def test_stamped_time_is_never_after_arrival():
     time = StampedTime()
     feed_delayed(time, np.zeros(20))
     assert time.estimate(500.0, START_S + 1).t_s == START_S + 1
 
 
-def test_a_delay_that_wavers_is_age_for_as_long_as_it_lasts():
+def test_stamped_time_counts_a_fluctuating_delay_as_age_while_it_lasts():
     """A network that is jammed for a minute, after ten pictures in time."""
     delays_s = np.where(np.arange(1200) < 10, 0.0, np.random.default_rng(1).uniform(2.0, 2.5, 1200))
     ages_s = feed_delayed(StampedTime(), delays_s)
@@ -154,7 +154,7 @@ def test_a_delay_that_wavers_is_age_for_as_long_as_it_lasts():
     assert is_known.mean() > 0.9
 
 
-def test_a_sender_that_has_paused_without_counting_is_new_again_after_ten_seconds():
+def test_stamped_time_resets_ten_seconds_after_a_pause_missing_in_the_timestamps():
     ages_s = feed_delayed(StampedTime(), np.where(np.arange(400) >= 100, 1.5, 0.0))
     assert ages_s[100] == pytest.approx(1.5, abs=0.01)
     assert np.isnan(ages_s[160:200]).all(), "it may have paused, or all of them may be held up"
@@ -162,7 +162,7 @@ def test_a_sender_that_has_paused_without_counting_is_new_again_after_ten_second
 
 
 @pytest.mark.parametrize("stamp_s", [0.0, 5000.0])
-def test_a_sender_that_begins_anew_is_followed(stamp_s):
+def test_stamped_time_follows_a_restarted_sender(stamp_s):
     time = StampedTime()
     feed_delayed(time, np.zeros(40))
     ages_s = feed_delayed(time, np.full(40, 10.0), stamp_s=stamp_s)
@@ -170,7 +170,7 @@ def test_a_sender_that_begins_anew_is_followed(stamp_s):
     assert ages_s[5:] == pytest.approx(np.zeros(35), abs=0.001)
 
 
-def test_pictures_that_are_sent_out_of_turn_are_no_new_beginning():
+def test_stamped_time_does_not_restart_at_images_out_of_order():
     time, order = StampedTime(), [0, 3, 1, 2, 6, 4, 5, 9, 7, 8, 12, 10, 11]
     for turn, number in enumerate(order):
         now = START_S + turn * STEP_S
@@ -179,7 +179,7 @@ def test_pictures_that_are_sent_out_of_turn_are_no_new_beginning():
 
 
 @pytest.mark.parametrize(("rate", "least_sd_s"), [(1.0, FRAME_TIME_SD_S), (0.48, 0.5)])
-def test_age_is_less_certain_where_stamps_are_counted(rate, least_sd_s):
+def test_age_is_less_certain_with_counted_timestamps(rate, least_sd_s):
     """A second in which nothing comes is the age of its picture by a clock; but a camera may have waited with it."""
     rng = np.random.default_rng(4)
     taken_s = np.arange(20 * 25) / 25
@@ -191,7 +191,7 @@ def test_age_is_less_certain_where_stamps_are_counted(rate, least_sd_s):
     assert sds_s[-2] == pytest.approx(FRAME_TIME_SD_S, rel=0.05)
 
 
-def test_without_stamps_a_picture_that_was_there_already_is_as_old_as_the_last_wait():
+def test_unstamped_time_ages_a_buffered_image_by_the_last_wait():
     time = UnstampedTime(opened_s=10.0)
     assert time.estimate(request_s=10.5, t_mono_s=10.5001).t_s == 10.0
     assert time.estimate(request_s=10.5, t_mono_s=10.6).t_s == 10.5, "it was waited for since then"
@@ -200,7 +200,7 @@ def test_without_stamps_a_picture_that_was_there_already_is_as_old_as_the_last_w
     assert waited.sd_s == pytest.approx(2.5 / math.sqrt(3), rel=0.01)
 
 
-def test_without_stamps_one_that_comes_when_it_is_due_is_new_and_one_that_was_held_up_may_be_old():
+def test_unstamped_time_trusts_an_image_that_is_on_time_but_not_a_late_one():
     time = UnstampedTime(opened_s=0.0)
     taken = [time.estimate(0.2 * number, 0.2 * number + 0.19) for number in range(20)]
     taken_s = [each.t_s for each in taken]

@@ -49,7 +49,7 @@ def arrivals(sender):
     assert sender.is_closed.wait(PATIENCE_S)
 
 
-def test_arrivals_keep_times_and_order_and_know_whether_a_key_frame_waits(sender, arrivals):
+def test_arrivals_keep_times_and_order_and_report_a_waiting_key_frame(sender, arrivals):
     for number in range(3):
         sender.send(11.0 + number, is_keyframe=number == 1)
     sender.end()
@@ -62,7 +62,7 @@ def test_arrivals_keep_times_and_order_and_know_whether_a_key_frame_waits(sender
     assert arrivals.next() is None, "the stream is still lost"
 
 
-def test_arrivals_take_a_failure_while_fetching_for_the_loss_of_the_stream(sender, arrivals, monkeypatch):
+def test_arrivals_treat_a_failed_fetch_as_a_lost_stream(sender, arrivals, monkeypatch):
     failures = []
     monkeypatch.setattr(threading, "excepthook", failures.append)
     sender.end(MemoryError())
@@ -72,7 +72,7 @@ def test_arrivals_take_a_failure_while_fetching_for_the_loss_of_the_stream(sende
 
 
 @pytest.mark.parametrize(("limit", "size"), [("_MAX_QUEUED_BYTES", 100_000), ("_MAX_QUEUED_PACKETS", 1)])
-def test_arrivals_are_bounded_and_go_on_with_a_key_frame(sender, arrivals, monkeypatch, limit, size):
+def test_arrivals_are_limited_and_continue_at_a_key_frame(sender, arrivals, monkeypatch, limit, size):
     """A decoder that hangs, or is too slow for long."""
     monkeypatch.setattr(streams, limit, 100 * size)
     most = 0
@@ -88,7 +88,7 @@ def test_arrivals_are_bounded_and_go_on_with_a_key_frame(sender, arrivals, monke
     assert found[-1].arrival_s == 1010.0, "the newest are kept"
 
 
-def test_arrivals_close_the_stream_by_the_thread_that_fetches_once_its_fetch_has_returned(sender, arrivals):
+def test_arrivals_close_the_stream_on_the_fetching_thread_after_its_fetch(sender, arrivals):
     threading.Thread(target=arrivals.cancel).start()
     assert arrivals.next() is None
     arrivals.close()

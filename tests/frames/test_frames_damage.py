@@ -45,7 +45,7 @@ def test_whole_stream_loses_nothing(stream, rows):
 
 
 @pytest.mark.parametrize("stream", CUT)
-def test_pictures_that_are_cut_are_refused_and_counted(stream, rows):
+def test_truncated_images_are_refused_and_counted(stream, rows):
     cut = rows[stream]
     assert (cut.old, cut.broken) == (0, 0)
     assert cut.refused["damaged"] > 20
@@ -59,14 +59,14 @@ def test_pictures_whose_bytes_are_corrupted_are_never_old(rows):
 
 
 @pytest.mark.parametrize("stream", LOSSY)
-def test_stream_that_loses_packets_gives_nothing_old_or_broken(stream, rows):
+def test_stream_with_packet_loss_gives_no_old_or_damaged_image(stream, rows):
     lossy = rows[stream]
     assert (lossy.old, lossy.broken) == (0, 0)
     assert lossy.delivered < lossy.sent
     assert sum(lossy.refused.values()) > PICTURES / 10
 
 
-def test_stream_decoded_too_slowly_leaves_pictures_out_and_none_is_old():
+def test_stream_decoded_too_slowly_skips_images_but_gives_no_old_ones():
     """Each takes twice as long as the stream has for it: one would be 1.5 s behind after 3 s."""
     (slow,) = damaged_streams.run(80, 1, only="MJPEG over HTTP, whole, decoded too slowly".__eq__, rate_hz=RATE_HZ)
     assert (slow.old, slow.broken) == (0, 0)

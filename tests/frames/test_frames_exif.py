@@ -58,7 +58,7 @@ def test_read_exif_ignores_a_height_above_the_ellipsoid_and_a_magnetic_heading(t
         {LAT: (46.0, 50.0)},
     ],
 )
-def test_read_exif_takes_a_senseless_position_for_none(gps, tmp_path):
+def test_read_exif_treats_an_implausible_position_as_unknown(gps, tmp_path):
     assert read_tag(tmp_path, GPS | gps).position is None
 
 
@@ -87,7 +87,7 @@ def test_photograph_lying_on_its_side_is_set_upright(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"rubbish", b"II*\x00", b"MM\x00*\xff\xff\xff\xff", b"II*\x00\x08\x00\x00\x00" * 9]
 )
-def test_read_exif_of_rubbish_or_nothing_is_no_tag(content, tmp_path, capfd):
+def test_read_exif_returns_an_empty_tag_for_missing_or_invalid_data(content, tmp_path, capfd):
     path = tmp_path / "rubbish.jpg"
     path.write_bytes(photographs.with_app1(photographs.encoded(".jpg", photographs.picture()), content))
     assert read_exif(path) == read_exif(tmp_path / "missing.jpg") == GeoTag()

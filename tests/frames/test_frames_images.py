@@ -123,12 +123,12 @@ TOO_MANY = "102 megapixels"
         ("wide.pgm", b"P5\n60000 60000\n255\n" + bytes(100), TOO_MANY),
     ],
 )
-def test_read_image_refuses_what_is_damaged_no_image_or_too_large(name, content, what, tmp_path, capfd):
+def test_read_image_refuses_damaged_too_large_and_other_files(name, content, what, tmp_path, capfd):
     assert what in complaint(write(tmp_path / name, content))
     assert capfd.readouterr().err == ""
 
 
-def test_read_image_refuses_what_is_no_file_and_waits_for_none(tmp_path):
+def test_read_image_refuses_pipes_and_devices_at_once(tmp_path):
     complaint(tmp_path / "nothing.jpg")
     (tmp_path / "folder.jpg").mkdir()
     assert "a directory" in complaint(tmp_path / "folder.jpg")
@@ -143,7 +143,7 @@ def test_list_images_sorts_as_a_person_counts(tmp_path):
     assert [path.name for path in list_images(tmp_path)] == ["a.tif", "img_2.Png", "IMG_9.JPG", "IMG_10.jpg"]
 
 
-def test_list_images_refuses_a_folder_without_and_names_those_inside(tmp_path):
+def test_list_images_refuses_a_folder_without_images_and_names_subfolders_with_images(tmp_path):
     (tmp_path / "notes.txt").touch()
     with pytest.raises(SourceError, match="nowhere"):
         list_images(tmp_path / "nowhere")
@@ -173,7 +173,7 @@ def whole_files(folder):
 
 
 @pytest.mark.slow
-def test_file_with_bytes_gone_wrong_is_read_or_refused_and_its_tags_never_leave_the_earth(tmp_path):
+def test_read_image_accepts_or_refuses_damaged_files_and_gives_only_valid_positions(tmp_path):
     chance, path = random.Random(5), tmp_path / "broken.jpg"
     for whole, most in whole_files(tmp_path):
         for _ in range(100):

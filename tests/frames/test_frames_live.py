@@ -96,7 +96,7 @@ def camera_of(kind, film, tmp_path):
 
 @pytest.mark.network
 @pytest.mark.parametrize("kind", ["udp", "http", "rtsp", "sdp"])
-def test_stream_that_is_lost_is_reported_and_opened_again(kind, film, opened, tmp_path):
+def test_lost_stream_is_reported_and_reopened(kind, film, opened, tmp_path):
     uri, switch_on = camera_of(kind, film, tmp_path)
     switch_off = switch_on()
     source = opened(uri)
@@ -116,7 +116,7 @@ def test_stream_that_is_lost_is_reported_and_opened_again(kind, film, opened, tm
 
 
 @pytest.mark.network
-def test_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened, capfd):
+def test_missing_stream_at_the_start_is_awaited_silently(opened, capfd):
     with socket.socket() as closed:  # bound but not listening: every connection is refused
         closed.bind(("127.0.0.1", 0))
         source = opened(f"tcp://127.0.0.1:{closed.getsockname()[1]}")
@@ -212,7 +212,7 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
         ((shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture again and again"),
     ],
 )
-def test_source_without_a_new_picture_is_reported_and_opened_anew(given, condition, text, live):
+def test_source_without_new_images_is_reported_and_reopened(given, condition, text, live):
     first = Camera(paced(itertools.chain(map(shot, range(5)), given)))
     source = live(first, Camera(paced(map(shot, itertools.count(100)))))
     wait_until(lambda: source.read(0.1) is None and source.condition is condition)
@@ -224,7 +224,7 @@ def test_source_without_a_new_picture_is_reported_and_opened_anew(given, conditi
 
 
 @pytest.mark.slow
-def test_picture_that_a_server_has_kept_is_not_new_after_a_loss(live):
+def test_image_cached_by_the_server_is_not_new_after_a_loss(live):
     kept = [shot(1), shot(2), shot(3)]
     source = live(Camera(kept), Camera(itertools.chain(paced([kept[-1]] * 30), map(shot, range(50, 52)))))
     wait_until(lambda: source.refused["frozen"] >= 30)
@@ -232,7 +232,7 @@ def test_picture_that_a_server_has_kept_is_not_new_after_a_loss(live):
     wait_until(lambda: source.read(0.1))
 
 
-def test_picture_that_is_older_than_the_one_before_is_refused(live):
+def test_image_older_than_the_previous_one_is_refused(live):
     source = live(Camera([shot(1, 998.1), shot(2, 998.0)]), clock=FakeClock())
     assert next_frame(source).t_mono_s == 998.1
     wait_until(lambda: source.refused["late"] == 1)
@@ -241,7 +241,7 @@ def test_picture_that_is_older_than_the_one_before_is_refused(live):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", ["open", "read", "pixels", "release"])
-def test_call_that_hangs_is_given_up_and_holds_nobody(step, monkeypatch, live):
+def test_hanging_call_is_abandoned_without_blocking(step, monkeypatch, live):
     monkeypatch.setattr(live_module, "_OPENING_TIMEOUT_S", 1.0)
     monkeypatch.setattr(liveness, "_UNKNOWN_RATE_TIMEOUT_S", 1.0)
     shots = map(shot, range(3)) if step == "release" else map(shot, itertools.count())
@@ -257,7 +257,7 @@ def test_call_that_hangs_is_given_up_and_holds_nobody(step, monkeypatch, live):
     assert hanging.is_released.wait(PATIENCE_S)
 
 
-def test_source_that_hangs_each_time_takes_no_more_than_three_threads(monkeypatch):
+def test_source_that_always_hangs_uses_at_most_three_threads(monkeypatch):
     monkeypatch.setattr(live_module, "_OPENING_TIMEOUT_S", 0.2)
     monkeypatch.setattr(live_module, "_FIRST_WAIT_S", 0.01)
     opened, go = [], threading.Event()
@@ -269,13 +269,13 @@ def test_source_that_hangs_each_time_takes_no_more_than_three_threads(monkeypatc
     source.close()
 
 
-def test_error_of_a_driver_is_a_loss_with_its_words():
+def test_driver_error_counts_as_a_loss_with_its_message():
     source = LiveSource(lambda: [].index("no such codec"), time.monotonic)
     wait_until(lambda: source.state == "ValueError: 'no such codec' is not in list, reopening in 0.5 s")
     source.close()
 
 
-def test_picture_that_cannot_be_converted_is_left_out(live):
+def test_image_that_cannot_be_converted_is_skipped(live):
     broken = replace(shot(1), convert=lambda: 1 / 0)
     assert next_frame(live(Camera(paced([broken, *map(shot, range(2, 20))], 20))))
 
@@ -299,7 +299,7 @@ def test_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch, live):
 
 
 @pytest.mark.parametrize("name", ["video97", "camera.sdp"])
-def test_device_that_comes_late_is_waited_for(name, tmp_path, monkeypatch):
+def test_missing_device_is_awaited(name, tmp_path, monkeypatch):
     monkeypatch.setattr(source_module, "is_live", lambda uri: True)
     path = tmp_path / name
     source = open_source(str(path), live=True)
@@ -321,7 +321,7 @@ LIVE = ("udp://:5600", "udp://@239.0.0.1:5600", "rtsp://user:secret@host/path", 
         *((uri, False, "live") for uri in LIVE),  # where the work has an end
     ],
 )
-def test_open_source_refuses_what_can_never_be_opened(uri, live, complaint):
+def test_open_source_refuses_sources_that_can_never_open(uri, live, complaint):
     with pytest.raises(SourceError) as refusal:
         open_source(uri, live=live)
     assert complaint in str(refusal.value)

@@ -29,18 +29,18 @@ NOISY = [
 
 
 @pytest.mark.parametrize("pictures", [[view(number) for number in range(100)], NOISY], ids=["flight", "hover"])
-def test_pictures_of_a_flight_and_noise_of_a_camera_that_stands_still_are_new(pictures):
+def test_find_repeats_accepts_flight_images_and_noise_of_a_static_camera(pictures):
     assert find_repeats(pictures) == [None] * len(pictures)
 
 
-def test_same_picture_is_frozen_for_as_long_as_it_lasts():
+def test_repeated_image_is_frozen_while_it_lasts():
     again = view(1)
     again[::40, ::40] += 1  # a grey level here and there does not make a picture new
     assert find_repeats([view(0), view(1), *[again] * 20, view(2)]) == [None, None, *[Refusal.FROZEN] * 20, None]
 
 
 @pytest.mark.parametrize("behind", [1, 2, 4])
-def test_picture_of_which_the_lower_part_is_older_is_patched(behind):
+def test_find_repeats_detects_an_image_whose_lower_part_is_older(behind):
     flown = [view(number) for number in range(40)]
     patched = [view(number) for number in range(40, 90)]
     for picture in patched:
@@ -48,7 +48,7 @@ def test_picture_of_which_the_lower_part_is_older_is_patched(behind):
     assert find_repeats([*flown, *patched, view(91)])[40:] == [Refusal.PATCHED] * 50 + [None]
 
 
-def test_what_stands_in_every_picture_is_no_patch():
+def test_find_repeats_ignores_static_parts_of_all_images():
     """A black border, a sky without a cloud, and the text of a display."""
     pictures = [view(number) for number in range(80)]
     for picture in pictures:
@@ -57,7 +57,7 @@ def test_what_stands_in_every_picture_is_no_patch():
     assert find_repeats(pictures) == [None] * 80
 
 
-def test_a_standing_scene_in_which_something_moves_is_no_patch():
+def test_find_repeats_accepts_motion_in_a_static_scene():
     """A camera on the ground without any noise, and somebody who walks through the picture."""
     pictures = [view(0) for _ in range(60)]
     for number, picture in enumerate(pictures):
@@ -65,5 +65,5 @@ def test_a_standing_scene_in_which_something_moves_is_no_patch():
     assert Refusal.PATCHED not in find_repeats(pictures)
 
 
-def test_a_picture_of_another_size_begins_anew():
+def test_find_repeats_restarts_at_an_image_of_another_size():
     assert find_repeats([view(0), view(0)[:96, :128], view(0)[:96, :128]]) == [None, None, Refusal.FROZEN]

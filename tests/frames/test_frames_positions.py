@@ -117,13 +117,13 @@ def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, writ
         ("file,lat,lon,rel_alt,rel_alt\n", "rel_alt"),
     ],
 )
-def test_read_positions_names_a_column_that_is_missing_or_there_twice(text, column, written):
+def test_read_positions_names_a_missing_or_duplicate_column(text, column, written):
     with pytest.raises(UsageError, match=f"line 1.*`{column}`"):
         read_positions(written(text))
     assert read_positions(written("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
 
 
-def test_read_positions_refuses_what_is_no_text(written, tmp_path):
+def test_read_positions_refuses_binary_files(written, tmp_path):
     with pytest.raises(UsageError, match=r"nothing\.csv"):
         read_positions(tmp_path / "nothing.csv")
     with pytest.raises(UsageError, match="text file"):
@@ -133,7 +133,7 @@ def test_read_positions_refuses_what_is_no_text(written, tmp_path):
         read_positions(tmp_path / "pipe.csv")
 
 
-def test_find_positions_in_the_folder_or_else_beside_it(tmp_path, monkeypatch):
+def test_find_positions_in_the_folder_or_next_to_it(tmp_path, monkeypatch):
     folder = tmp_path / "ref"
     folder.mkdir()
     assert find_positions(folder) is None
@@ -159,7 +159,7 @@ def track(written):
     return lambda text: read_track(written(text))
 
 
-def test_tag_at_interpolates_and_turns_the_shorter_way(track):
+def test_interpolate_tag_rotates_headings_the_shorter_way(track):
     found = track(
         "time,lat,lon,alt,yaw_deg,roll_deg,pitch_deg,rel_alt\n10,50,179.999,600,350,-4,2,80\n12,51,-179.999,604,20,4,,90\n"
     )
@@ -172,7 +172,7 @@ def test_tag_at_interpolates_and_turns_the_shorter_way(track):
     assert found.interpolate_tag(11.5).position.lon_deg == pytest.approx(-179.9995)
 
 
-def test_tag_at_makes_nothing_up_outside_the_table_and_in_wide_gaps(track):
+def test_interpolate_tag_is_none_outside_the_table_and_in_wide_gaps(track):
     found = track("time,lat,lon\n1,50,8\n2,,\n6,50.1,8\n11.1,50.2,8\n12,0,0\n13,50.3,8\n")
     assert [found.interpolate_tag(t_s).position is not None for t_s in (0.9, 1, 3, 6, 8, 11.1, 12, 13, 13.1)] == [
         False, True, True, True, False, True, True, True, False

@@ -54,7 +54,7 @@ def check_three_frames(source, shape):
     assert source.condition is Condition.RUNNING
 
 
-def test_ribbon_camera_gives_whole_pictures_and_the_program_ends_with_the_source(rpicam):
+def test_ribbon_camera_gives_complete_images_and_its_program_ends_with_the_source(rpicam):
     before = running()
     source = rpicam()
     check_three_frames(source, (960, 1280, 3))
@@ -63,7 +63,7 @@ def test_ribbon_camera_gives_whole_pictures_and_the_program_ends_with_the_source
     wait_until(lambda: not running() - before)
 
 
-def test_ribbon_camera_that_hangs_is_started_anew(rpicam, monkeypatch):
+def test_ribbon_camera_is_restarted_if_it_hangs(rpicam, monkeypatch):
     monkeypatch.setenv("FAKE_RPICAM", "hangs")
     source = rpicam()
     wait_until(lambda: source.read(1.0))
@@ -71,7 +71,7 @@ def test_ribbon_camera_that_hangs_is_started_anew(rpicam, monkeypatch):
     wait_until(lambda: source.read(1.0))
 
 
-def test_ribbon_camera_that_starts_slowly_is_waited_for(rpicam, monkeypatch):
+def test_ribbon_camera_may_start_slowly(rpicam, monkeypatch):
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.5)
     monkeypatch.setenv("FAKE_RPICAM", "slow")
     before = running()
@@ -81,7 +81,7 @@ def test_ribbon_camera_that_starts_slowly_is_waited_for(rpicam, monkeypatch):
     assert running() - before == {process}, "it was not started anew"
 
 
-def test_program_that_gives_no_picture_for_long_is_ended(rpicam, monkeypatch):
+def test_program_without_images_is_ended_after_a_timeout(rpicam, monkeypatch):
     monkeypatch.setattr(programs, "_FIRST_PICTURE_TIMEOUT_S", 1.0)
     monkeypatch.setenv("FAKE_RPICAM", "slow")
     source = rpicam()
@@ -105,7 +105,7 @@ def test_error_lines_explain_the_exit_of_a_program(text, explanation):
     assert errors.explain_exit() == explanation
 
 
-def test_ribbon_camera_that_is_not_there_is_reported_and_tried_again(rpicam, monkeypatch, caplog):
+def test_ribbon_camera_missing_is_reported_and_retried(rpicam, monkeypatch, caplog):
     monkeypatch.setenv("FAKE_RPICAM", "absent")
     source = rpicam()
     wait_until(lambda: source.condition is Condition.LOST)
@@ -118,7 +118,7 @@ def test_ribbon_camera_that_is_not_there_is_reported_and_tried_again(rpicam, mon
 @pytest.mark.parametrize(
     ("uri", "packages"), [("rpicam", "rpicam-apps"), ("rpicam:1", "rpicam-apps"), (GST, "gstreamer1.0-tools")]
 )
-def test_without_the_program_the_sentence_says_what_to_install(monkeypatch, tmp_path, uri, packages):
+def test_open_source_names_the_package_of_a_missing_program(monkeypatch, tmp_path, uri, packages):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert is_live(uri)
     assert not is_live("rpicam:x")
@@ -127,14 +127,14 @@ def test_without_the_program_the_sentence_says_what_to_install(monkeypatch, tmp_
 
 
 @pytest.mark.parametrize("pipeline", ["gst:", "gst: ! appsink", "gst: v4l2src device='/dev/video0"])
-def test_what_is_no_pipeline_is_refused(pipeline):
+def test_open_source_refuses_an_invalid_pipeline(pipeline):
     with pytest.raises(SourceError, match="is not a pipeline"):
         open_source(pipeline, live=True)
 
 
 @needs_gstreamer
 @pytest.mark.parametrize("end", ["", " ! videoconvert ! appsink drop=true"])
-def test_pipeline_gives_pictures_and_ends_with_the_source(opened, end):
+def test_pipeline_gives_images_and_ends_with_the_source(opened, end):
     before = running("gst-launch-1.0 -q videotestsrc")
     source = opened(GST + end)
     check_three_frames(source, (240, 320, 3))
@@ -143,7 +143,7 @@ def test_pipeline_gives_pictures_and_ends_with_the_source(opened, end):
     wait_until(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)
 
 
-def test_no_program_outlives_a_flight_that_is_killed(rpicam):
+def test_programs_end_with_a_killed_flight(rpicam):
     before = running()
     reading = (
         "from edgevpr.frames.source import open_source; s = open_source('rpicam', live=True)\nwhile True: s.read(1)"

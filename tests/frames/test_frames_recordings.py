@@ -111,7 +111,7 @@ def test_recorded_steps_need_a_time_of_each_image_in_order(folder, times, steps_
     assert told == [*steps_s, *[None] * (len(times) - len(steps_s))]
 
 
-def test_positions_that_cannot_be_meant_for_the_source_are_refused(folder, video, tmp_path):
+def test_positions_that_do_not_fit_the_source_are_refused(folder, video, tmp_path):
     write_picture(folder / "a.jpg")
     (tmp_path / "other.csv").write_text("file,lat,lon\nb.jpg,3,4\n")
     with pytest.raises(UsageError, match=r"other\.csv"):
@@ -161,7 +161,7 @@ def test_frames_of_a_video_are_at_least_a_step_apart(step_s, stride, video):
     assert abs(source.total - len(frames)) <= 1
 
 
-def test_only_the_frames_that_are_asked_for_are_read(folder, video):
+def test_open_source_reads_only_the_requested_frames(folder, video):
     for name in ("a.png", "b.png", "c.png"):
         write_picture(folder / name)
     (folder / "d.png").write_bytes(b"no picture, and not asked for")
@@ -192,7 +192,7 @@ def read_time(frame):
     return frame.name.split("t=")[1]
 
 
-def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
+def test_video_skips_damaged_frames_and_those_that_depend_on_them(tmp_path):
     path = film(tmp_path / "flight.mkv", "libx264", IN_ORDER)
     whole, complaints, *_ = read_with_complaints(path)
     assert (len(whole), complaints) == (75, [])
@@ -211,7 +211,7 @@ def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
     assert "cannot be used (damaged, or dependent on damaged frames): copy the video again." in complaint
 
 
-def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
+def test_video_skips_frames_predicted_from_a_missing_one(tmp_path):
     """Of an MPEG transport stream, recorded from a radio link that lost the packets of a whole frame: no decoder finds
     anything wrong with the frames after it."""
     path = film(tmp_path / "flight.ts", "libx264", IN_ORDER)
@@ -228,7 +228,7 @@ def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["flight.mkv", "flight.avi", "flight.mp4"])
-def test_video_that_is_cut_short_is_reported(name, tmp_path):
+def test_truncated_video_is_reported(name, tmp_path):
     index_first = {"movflags": "faststart"} if name.endswith("mp4") else {}
     path = film(tmp_path / name, "mpeg4", {"qmin": "3", "qmax": "3"}, **index_first)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -241,7 +241,7 @@ def test_video_that_is_cut_short_is_reported(name, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content"), [("text.mp4", b"no video" * 100), ("empty.mp4", b""), ("data.bin", bytes(9999))]
 )
-def test_a_file_that_is_no_video_is_refused(name, content, tmp_path, capfd):
+def test_open_source_refuses_a_file_that_is_not_a_video(name, content, tmp_path, capfd):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(SourceError, match=f"{name} .*video"):
         open_source(str(tmp_path / name), live=False)

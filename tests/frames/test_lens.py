@@ -68,7 +68,7 @@ def photograph_board(camera, rng):
 
 
 @pytest.mark.slow
-def test_script_of_the_docs_calibrates_a_lens_that_is_known(tmp_path, monkeypatch):
+def test_calibration_script_of_the_docs_recovers_a_known_lens(tmp_path, monkeypatch):
     camera, page = wide(), (Path(__file__).parents[2] / "docs/how-to/cameras.md").read_text("utf-8")
     (tmp_path / "board").mkdir()
     rng = np.random.default_rng(0)
@@ -122,7 +122,7 @@ def test_read_lens_of_ros_and_kalibr(tmp_path, text, model, coefficients):
         ("nothing: here", {}, "OpenCV, ROS or Kalibr"),
     ],
 )
-def test_read_lens_refuses_what_is_no_calibration(tmp_path, text, given, says):
+def test_read_lens_refuses_files_that_are_not_calibrations(tmp_path, text, given, says):
     path = written(tmp_path / "lens.yaml", text, **given)
     with pytest.raises(ConfigError, match=says) as error:
         read_lens(path)
@@ -160,7 +160,7 @@ CAMERAS = pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "f
 
 
 @CAMERAS
-def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, ground):
+def test_undistort_frame_equals_an_image_without_distortion(camera, ground):
     lens, frame = make_lens(camera), photograph(camera, ground)
     found = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens)
     sight = compute_lens_view(lens, SIZE_PX)
@@ -184,7 +184,7 @@ def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, g
         {},
     ],
 )
-def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose):
+def test_level_image_levels_and_undistorts_in_one_warp(camera, ground, pose):
     lens = make_lens(camera)
     footprint_m = 150.0
     found = level_image(
@@ -202,7 +202,7 @@ def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose
     assert difference(found.image[shown], straight[shown]) < 1.5
 
 
-def test_a_mask_of_the_camera_follows_its_picture(ground):
+def test_undistort_frame_moves_the_mask_with_its_image(ground):
     camera = wide()
     overlay = np.ones(SIZE_PX[::-1], bool)
     overlay[:, :160] = False
@@ -214,7 +214,7 @@ def test_a_mask_of_the_camera_follows_its_picture(ground):
     assert np.array_equal(found.mask[sure], found.image[sure] > 128)
 
 
-def test_what_lies_beyond_the_lens_shows_no_ground(ground):
+def test_level_image_masks_what_is_outside_the_lens(ground):
     """With strong barrel distortion alone, directions far outside of the picture have pixels inside of it too."""
     camera = DistortedCamera(512.0, (-0.3, 0, 0, 0))
     lens = make_lens(camera)

@@ -63,7 +63,7 @@ def difference(one, other, mask):
         ({"pitch_deg": 60, "heading_deg": 300}, 0.9),  # its upper edge is above 80 degrees
     ],
 )
-def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below):
+def test_level_image_equals_an_image_taken_straight_down(ground, pose, shown, below):
     found = level_image(taken(ground, **pose), None, LENS, FOOTPRINT_M, below=below)
     assert (found.view.up_deg, found.view.reason) == (0.0, None)
     assert found.view.footprint_m == pytest.approx(FOOTPRINT_M)
@@ -78,7 +78,7 @@ def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below
 
 
 @pytest.mark.parametrize("up_deg", [90.0, 180.0, 270.0])
-def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
+def test_level_image_accepts_a_rotated_camera(ground, up_deg):
     """A quarter turn of the camera to the right turns its picture by one to the left."""
     square = replace(CAMERA, width=640, height=640)
     pose = {"height_m": HEIGHT_M, "heading_deg": 20.0, "roll_deg": 10.0, "pitch_deg": -5.0}
@@ -91,7 +91,7 @@ def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
     assert (upright.image is image, upright.view.up_deg) == (True, 0.0), "its top points north as it is"
 
 
-def test_levelled_without_a_heading_turns_nothing(ground):
+def test_level_image_does_not_rotate_without_a_heading(ground):
     steep, tilted = (replace(taken(ground, heading_deg=0, pitch_deg=deg), heading_deg=None) for deg in (25, 18))
     assert level_image(steep, None, LENS, below=True).view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING
     for frame in (steep, tilted):
@@ -100,7 +100,7 @@ def test_levelled_without_a_heading_turns_nothing(ground):
         assert difference(found.image, photograph_above(ground, found.view), found.mask) < 0.5
 
 
-def test_levelled_without_a_height_scales_nothing(ground):
+def test_level_image_does_not_scale_without_a_height(ground):
     pose = {"heading_deg": 60, "roll_deg": 18}
     unknown = replace(taken(ground, **pose), height_m=None)
     found, known = level_image(unknown, None, LENS, FOOTPRINT_M / 2), level_image(taken(ground, **pose), None, LENS)
@@ -109,7 +109,7 @@ def test_levelled_without_a_height_scales_nothing(ground):
     assert known.view.footprint_m == pytest.approx(FOOTPRINT_M)
 
 
-def test_levelled_without_an_attitude_knows_no_point_below(ground):
+def test_level_image_has_no_nadir_without_an_attitude(ground):
     found = level_image(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
     width_m, focal = pytest.approx(FOOTPRINT_M), pytest.approx(LENS_FOCAL)
     assert found.view == View(up_deg=0.0, footprint_m=width_m, focal=focal, rotation_deg=90.0)
@@ -119,7 +119,7 @@ def test_levelled_without_an_attitude_knows_no_point_below(ground):
 @pytest.mark.parametrize(
     "told", [{}, {"roll_deg": 0.4, "pitch_deg": -0.6}, {"heading_deg": 359.4}, {"height_m": 102.0}]
 )
-def test_levelled_returns_the_same_object_where_nothing_is_known_or_needed(told):
+def test_level_image_returns_the_same_object_if_nothing_is_known_or_needed(told):
     image = np.zeros((48, 64), np.uint8)
     found = level_image(make_frame(image, **told), None, LENS, FOOTPRINT_M)
     assert found.image is image
@@ -127,7 +127,7 @@ def test_levelled_returns_the_same_object_where_nothing_is_known_or_needed(told)
     assert (found.view.up_deg, found.view.reason) == (told.get("heading_deg"), None)
 
 
-def test_levelled_leaves_a_surveyed_picture_as_it_is(ground):
+def test_level_image_leaves_a_surveyed_image_unchanged(ground):
     pose = Pose(up_deg=30.0, footprint_m=50.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
     frame = replace(taken(ground, heading_deg=90, pitch_deg=20), pose=pose)
     found = level_image(frame, None, LENS, FOOTPRINT_M)
@@ -136,7 +136,7 @@ def test_levelled_leaves_a_surveyed_picture_as_it_is(ground):
 
 
 @pytest.mark.parametrize("height_m", [0.0, -3.0, 10_001.0, math.nan, math.inf, 25.0, 500.0])
-def test_levelled_scales_nothing_by_a_height_that_cannot_be(ground, height_m):
+def test_level_image_ignores_an_implausible_height(ground, height_m):
     """25 and 500 m can be, and are too far from the map's to be of use."""
     frame = replace(taken(ground, heading_deg=90), height_m=height_m)
     found, unknown = (level_image(each, None, LENS, FOOTPRINT_M) for each in (frame, replace(frame, height_m=None)))
@@ -144,7 +144,7 @@ def test_levelled_scales_nothing_by_a_height_that_cannot_be(ground, height_m):
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
-def test_levelled_takes_what_is_no_number_as_unknown(wrong):
+def test_level_image_treats_nan_as_unknown(wrong):
     odd = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg", "height_m"), wrong)
     found = level_image(make_frame(np.zeros((48, 64), np.uint8), **odd), None, LENS, FOOTPRINT_M)
     assert found.view == View(focal=pytest.approx(LENS_FOCAL))
@@ -156,7 +156,7 @@ TILTED = {"heading_deg": 90.0, "roll_deg": 0.0, "pitch_deg": 40.0}
 @pytest.mark.parametrize(
     "pose", [{"pitch_deg": 64.0}, {"roll_deg": -65.0}, {"roll_deg": 180.0}, {"pitch_deg": 90.0}, {"roll_deg": 1e9}]
 )
-def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
+def test_level_image_refuses_an_impossible_warp_with_a_reason(pose):
     image = np.zeros((48, 64), np.uint8)
     found = level_image(make_frame(image, **TILTED | pose), None, LENS)
     assert found.image is image
@@ -165,13 +165,13 @@ def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
 
 
 @pytest.mark.parametrize("below", [False, True])
-def test_levelled_keeps_the_middle_of_a_steep_picture_in_place_of_what_is_below(below):
+def test_level_image_keeps_the_centre_of_a_steep_image(below):
     found = level_image(make_frame(np.zeros((48, 64), np.uint8), **TILTED), None, Lens(40.0), below=below)
     assert found.view.reason is None
     assert found.view.nadir_offset != (0.0, 0.0)
 
 
-def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):
+def test_level_image_completes_the_frame_from_the_vehicle(ground):
     pose = {"heading_deg": 50, "roll_deg": 12, "pitch_deg": 8, "height_m": 120}
     known = taken(ground, **pose)
     vehicle = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=300.0, t_received_s=0.0, has_gps=True, **pose)
@@ -182,7 +182,7 @@ def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):
     assert np.array_equal(by_frame.image, by_vehicle.image)
 
 
-def test_levelled_makes_a_large_picture_smaller_without_leaving_pixels_out():
+def test_level_image_shrinks_a_large_image_without_skipping_pixels():
     """Rows of one pixel, black and white in turns, become grey; a warp alone would make stripes of them."""
     stripes = np.zeros((3000, 4000), np.uint8)
     stripes[::2] = 200

@@ -36,7 +36,7 @@ def must_reopen(fault):
 @pytest.mark.parametrize(
     ("interval_s", "lost_s"), [(0.04, 3.0), (1.0, 3.0), (2.0, 5.0), (5.0, 12.5), (10.0, 25.0), (20.0, 30.0)]
 )
-def test_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, lost_s):
+def test_source_is_lost_after_three_seconds_or_longer_at_a_low_rate(interval_s, lost_s):
     watched = make_liveness(*(number * interval_s for number in range(8)))
     assert measure_fault_s(watched, is_(Condition.LOST), 7 * interval_s) == lost_s
     assert measure_fault_s(watched, must_reopen, 7 * interval_s) == lost_s
@@ -69,7 +69,7 @@ def test_source_without_a_usable_picture_has_a_fault_in_time(new_s, opened_s, re
     assert measure_fault_s(watched, wanted, opened_s or max(new_s, default=0.0), refusal) == after_s
 
 
-def test_source_opened_anew_keeps_its_rate():
+def test_reopened_source_keeps_its_rate():
     watched = make_liveness(0.0, 0.1, 0.2)
     watched.record_opening(20.0)
     watched.record_picture(25.0)
@@ -81,7 +81,7 @@ def test_source_opened_anew_keeps_its_rate():
     ("repeats", "step_s", "is_frozen"),
     [(5, 0.1, False), (11, 0.1, True), (2, 0.9, False), (3, 0.9, True), (3, 0.2, False)],
 )
-def test_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
+def test_image_repeated_three_times_over_a_second_is_frozen(repeats, step_s, is_frozen):
     watched = make_liveness(0.0, 0.1)
     for _ in range(repeats):
         watched.record_refusal(Refusal.FROZEN, 0.1)
@@ -89,7 +89,7 @@ def test_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, st
     assert (fault is not None and fault.condition is Condition.FROZEN) == is_frozen
 
 
-def test_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pictures():
+def test_frozen_source_is_reopened_at_growing_intervals_until_images_change():
     watched, waits_s = make_liveness(0.0, 0.1), []
     for _ in range(5):
         watched.record_opening(0.0)
@@ -102,7 +102,7 @@ def test_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pic
     assert measure_fault_s(watched, must_reopen, 0.2, Refusal.FROZEN) == 5.0
 
 
-def test_new_picture_ends_every_fault():
+def test_new_image_ends_each_fault():
     for refusal in (Refusal.FROZEN, Refusal.DAMAGED, Refusal.PATCHED, Refusal.LATE):
         watched = make_liveness(0.0, 0.1)
         for _ in range(20):

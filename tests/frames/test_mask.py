@@ -31,13 +31,13 @@ def test_mask_is_known_by_its_pixels(tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.61, 1.0])
-def test_mask_that_leaves_too_little_is_refused(tmp_path, share):
+def test_load_mask_refuses_a_mask_that_covers_too_much(tmp_path, share):
     with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, but at most 60% is allowed"):
         load_mask(written(tmp_path / "m.png", masked(share, 100, 100)))
     assert load_mask(written(tmp_path / "m.png", masked(0.6, 100, 100))).allowed.mean() == 0.4
 
 
-def test_mask_that_is_no_image_is_refused(tmp_path):
+def test_load_mask_refuses_a_file_that_is_not_an_image(tmp_path):
     (tmp_path / "m.png").write_bytes(b"\x89PNG\r\n\x1a\ncut")
     for path in (tmp_path / "m.png", tmp_path / "missing.png"):
         with pytest.raises(ImageError, match=rf"source\.mask.*{path.name}"):

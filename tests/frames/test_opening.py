@@ -151,7 +151,7 @@ def first_frame(source):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("over_tcp", ["461", "offer"])
-def test_rtsp_of_a_camera_that_sends_by_udp_only(over_tcp, opened, serve):
+def test_rtsp_falls_back_to_udp(over_tcp, opened, serve):
     source = opened(f"rtsp://{serve(rtsp(refuses='', over_tcp=over_tcp))}/stream")
     first_frame(source)
     assert (source.facts.codec, source.facts.bits, source.facts.pixel_aspect) == ("h264", 8, 1.0)
@@ -173,7 +173,7 @@ def test_rtp_at_a_udp_port_is_read_without_a_description(scheme, send, codec, op
     assert source.facts.codec == codec
 
 
-def test_ports_that_are_in_use_are_named(sending):
+def test_open_address_names_ports_in_use(sending):
     port = sending(send_rtp)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", port + 1))
@@ -197,13 +197,13 @@ def test_rtp_of_an_unknown_codec_asks_for_a_description(sending):
 
 @pytest.mark.parametrize("has_length", [True, False])
 @pytest.mark.parametrize(("kind", "extension"), [("image/jpg", ".jpg"), ("image/png", ".png")])
-def test_parts_of_any_image_type_are_read(kind, extension, has_length, opened, serve):
+def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, opened, serve):
     source = opened(f"http://{serve(multipart(kind, extension, has_length))}/video")
     numbers = [int(first_frame(source).name.split()[1]) for _ in range(3)]
     assert numbers == sorted(set(numbers))
 
 
-def test_parts_without_a_length_do_not_wait_for_the_next(opened, serve):
+def test_multipart_stream_without_lengths_does_not_wait_for_the_next_part(opened, serve):
     """FFmpeg gives such a picture when the next one has come, as if it had been taken then."""
     connections: list[list[float]] = []
     source = opened(f"http://{serve(multipart(has_length=False, connections=connections))}/video")
@@ -232,7 +232,7 @@ def test_connection_of_a_multipart_stream_is_closed_with_the_capture(serve):
     assert is_closed.wait(PATIENCE_S)
 
 
-def test_snapshots_are_requested_again_and_again_and_as_old_as_the_request(serve):
+def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
     asked_s: list[float] = []
 
     def taken(number):
@@ -249,14 +249,14 @@ def test_snapshots_are_requested_again_and_again_and_as_old_as_the_request(serve
     assert first.t_mono_s + 0.1 <= second.t_mono_s <= asked_s[-1]
 
 
-def test_snapshots_that_the_camera_keeps_ready_are_as_old_as_the_request_before(serve):
+def test_snapshots_cached_by_the_camera_are_aged_from_the_previous_request(serve):
     address = serve(http("200 OK", "image/jpeg", lambda number: encoded(number // 2)))
     capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     *_, last = (capture.read() for _ in range(4))
     assert time.monotonic() - last.t_mono_s > 0.1
 
 
-def test_snapshots_that_are_cut_are_damaged_and_those_that_fail_are_lost(opened, serve):
+def test_snapshots_truncated_are_damaged_and_failed_ones_lost(opened, serve):
     pictures = iter([encoded(0), encoded(1), encoded(2)[:900], b""])
     server = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
     source = opened(f"http://{server.address}/snapshot.jpg")
@@ -265,7 +265,7 @@ def test_snapshots_that_are_cut_are_damaged_and_those_that_fail_are_lost(opened,
     wait_until(lambda: source.condition is Condition.LOST)
 
 
-def test_snapshots_take_a_password(serve):
+def test_snapshots_accept_a_password(serve):
     right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
 
     def answer(connection, asked):

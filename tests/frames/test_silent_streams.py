@@ -54,7 +54,7 @@ def two_codecs(connection):
 
 
 @pytest.mark.parametrize(("first", "later"), [(pictures_then_sound, pictures_then_sound), (two_codecs, one_codec)])
-def test_stream_whose_pictures_end_is_lost_and_opened_again(first, later):
+def test_stream_without_further_images_is_lost_and_reopened(first, later):
     viewers = []
 
     def answer(connection, asked):

@@ -94,7 +94,7 @@ def test_read_xmp_of_a_gimbal_tilted_to_its_side(read):
 
 
 @pytest.mark.parametrize("value", ["nan", "-1e9", "361", "", "0/100", "north", "+-"])
-def test_read_xmp_takes_a_senseless_value_as_unknown(read, value):
+def test_read_xmp_treats_an_implausible_value_as_unknown(read, value):
     assert read(packet(gimbal(10, value, 0))) == GeoTag()
     assert read(packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
 

@@ -63,14 +63,14 @@ def build(folder, *flags, images="images"):
     [(down, None, 2), (ahead, None, 0), (down, -10, 0), (ahead, -85, 2)],
     ids=["down", "ahead", "a gimbal that looks ahead", "a gimbal that looks down"],
 )
-def test_a_camera_that_looks_down_must_be_said_to(folder, view, pitch_deg, code):
+def test_map_build_requires_camera_nadir_for_downward_images(folder, view, pitch_deg, code):
     here = folder(view, pitch_deg=pitch_deg)
     assert build(here) == code
     assert (here / "m.gpkg").exists() == (code == 0)
 
 
 @pytest.mark.slow
-def test_the_ground_of_a_map_is_measured(folder, capsys):
+def test_map_build_reports_the_covered_ground(folder, capsys):
     lines = [f"{number}.jpg,{50 + 0.001 * number:.3f},{8 if number % 2 else 8.001}" for number in range(8)]
     assert build(folder(ahead, lines), "--no-calibrate") == 0
     covered = json.loads(capsys.readouterr().out)["covered"]
@@ -93,12 +93,12 @@ def drawn_over(number: int) -> Image:
     return image
 
 
-def test_only_what_is_drawn_stands_still():
+def test_measure_static_share_finds_only_the_overlay():
     assert measure_static_share(map(bare, range(20)), None) == 0
     assert 0.006 < measure_static_share(map(drawn_over, range(20)), None) < 0.05
 
 
-def test_a_mask_leaves_it_out(tmp_path):
+def test_measure_static_share_leaves_out_the_mask(tmp_path):
     painted = np.full((240, 320), 255, np.uint8)
     painted[:45, :150] = painted[95:145, 135:185] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), painted)
@@ -106,7 +106,7 @@ def test_a_mask_leaves_it_out(tmp_path):
 
 
 @pytest.mark.parametrize("numbers", [range(11), [3] * 20], ids=["few pictures", "an aircraft that stands"])
-def test_what_cannot_be_told_is_not_told(numbers):
+def test_measure_static_share_is_unknown_without_enough_evidence(numbers):
     assert measure_static_share(map(drawn_over, numbers), None) is None
 
 

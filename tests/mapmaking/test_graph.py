@@ -57,7 +57,7 @@ def off(solved, position, log):
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
-def test_solve_graph_makes_noisy_positions_exact_and_names_wrong_ties(wrong):
+def test_solve_graph_corrects_noisy_positions_and_lists_wrong_ties(wrong):
     position, log = flight()
     ties, lies = ties_of(position, log, wrong=wrong)
     solved = solve_graph(recorded_of(position), ties)
@@ -71,7 +71,7 @@ def test_solve_graph_makes_noisy_positions_exact_and_names_wrong_ties(wrong):
 
 
 @pytest.mark.slow
-def test_solve_graph_gives_covariances_that_are_those_of_the_errors():
+def test_solve_graph_covariances_match_the_errors():
     position, log = flight(legs=3, a_leg=8)
     far, turned = [], []
     for seed in range(30):
@@ -86,7 +86,7 @@ def test_solve_graph_gives_covariances_that_are_those_of_the_errors():
         assert np.mean(abs(one_axis) < 2) == pytest.approx(0.95, abs=0.03)
 
 
-def test_variances_are_those_of_the_whole_inverse_also_where_entries_cancel():
+def test_variances_equal_those_of_the_full_inverse_even_if_entries_cancel():
     rng = np.random.default_rng(1)
     for _ in range(400):  # with so few different values, entries of the factor are zero by chance in one of 400
         places, ties = int(rng.integers(5, 60)), int(rng.integers(60, 200))

@@ -37,7 +37,7 @@ def test_find_headings_finds_those_of_a_turning_camera(frames):
     assert found == pytest.approx([heading_deg for _, heading_deg in frames], abs=3)
 
 
-def test_find_headings_leaves_level_frames_those_with_a_heading_and_those_in_one_place(frames):
+def test_find_headings_skips_level_frames_known_headings_and_hovers(frames):
     first = frames[0][0]
     level = [replace(frame, pitch_deg=5.0) for frame, _ in frames]
     known = [replace(frame, heading_deg=7.0) for frame, _ in frames]

@@ -70,7 +70,7 @@ def opened(path, pictures):
         yield place_map, measure_look_alikes(AHEAD, place_map, index, near_m, described)
 
 
-def test_measure_look_alikes_finds_doors_of_one_kind_among_single_views(tmp_path):
+def test_measure_look_alikes_finds_similar_doors_among_single_views(tmp_path):
     with opened(tmp_path, single_views()) as (_, look_alikes):
         assert not look_alikes.overlap
         first, second = look_alikes.places.pop(FIRST), look_alikes.places.pop(SECOND)
@@ -78,14 +78,14 @@ def test_measure_look_alikes_finds_doors_of_one_kind_among_single_views(tmp_path
         assert first.agree == second.agree > max(first.own, *(other.agree for other in look_alikes.places.values()))
 
 
-def test_measure_look_alikes_takes_neighbours_along_a_way_for_the_same_ground(tmp_path):
+def test_measure_look_alikes_treats_neighbours_along_a_route_as_the_same_ground(tmp_path):
     with opened(tmp_path, along_a_way()) as (_, look_alikes):
         assert look_alikes.overlap
         assert look_alikes.twins == 0
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_a_door_seen_from_where_its_twin_was_pictured_is_accepted_only_if_nobody_knows_of_the_twin(tmp_path, known):
+def test_look_alikes_refuse_a_door_that_resembles_its_twin(tmp_path, known):
     with opened(tmp_path, single_views()) as (place_map, look_alikes):
         rule = make_accept_rule(AHEAD, load_config(None).match)
         walk = walk_over(place_map, AHEAD, replace(rule, look_alikes=look_alikes) if known else rule)
@@ -95,7 +95,7 @@ def test_a_door_seen_from_where_its_twin_was_pictured_is_accepted_only_if_nobody
         assert (event.confidence <= 0.5) == known
 
 
-def test_a_single_view_without_a_twin_is_accepted_by_its_regions(tmp_path):
+def test_single_view_without_a_twin_is_accepted_by_its_regions(tmp_path):
     with opened(tmp_path, single_views()) as (place_map, look_alikes):
         rule = replace(make_accept_rule(AHEAD, load_config(None).match), look_alikes=look_alikes)
         walk = walk_over(place_map, AHEAD, rule)

@@ -67,7 +67,7 @@ def calibrated(place_map, pictures, technique=AHEAD, **more):
     return calibrate(encoder, place_map, CONFIG, query_meter(), pictures, iterate_silently)
 
 
-def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
+def test_query_map_queries_each_image_in_three_ways(place_map):
     index, rule = load_index(place_map, AHEAD, 10**6), make_accept_rule(AHEAD, CONFIG)
     pictures = [(number + 1, LevelledImage(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
     answers = list(query_map(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
@@ -80,7 +80,7 @@ def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
     assert list(query_map(AHEAD, place_map, index, rule, query_meter(), pictures, seed=1)) != answers
 
 
-def test_a_calibration_is_kept_in_the_map(place_map):
+def test_calibration_is_stored_in_the_map(place_map):
     pictures, asked = at_hand(*map(frame, range(PLACES)))
     found = calibrated(place_map, pictures)
     assert read_calibration(place_map.calibration) == found
@@ -92,7 +92,7 @@ def test_a_calibration_is_kept_in_the_map(place_map):
     assert 0 <= found.accepted <= 1
 
 
-def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
+def test_calibration_skips_an_unreadable_place(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
     build_map([frame(20)], FrameEncoder(technique=AHEAD), place_map)
@@ -130,7 +130,7 @@ def test_build_map_counts_tilted_images_by_what_is_missing(tmp_path, pitch_deg, 
     assert result.added == 1 - sum(left_out)
 
 
-def test_a_map_that_looks_alike_everywhere_says_so(tmp_path):
+def test_calibration_reports_a_map_that_looks_alike_everywhere(tmp_path):
     """Water: the same few faint waves on every picture."""
     waves = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(240, 320)), (0, 0), 2)
     waves = cv2.normalize(waves, None, 90, 130, cv2.NORM_MINMAX)
@@ -156,7 +156,7 @@ def rows_of(count, seed=1):
     return [{"a": float(is_right + rng.normal(0, 0.5)), "b": float(2 * rng.normal())} for is_right in right], right
 
 
-def test_what_tells_right_from_wrong_weighs_and_the_rest_does_not():
+def test_fit_logistic_weights_only_features_that_separate_the_classes():
     rows, right = rows_of(2000)
     found = fit_logistic(START, rows, right, np.ones(len(rows)), 1.0)
     # Two normal distributions, 1 apart with the variance 0.25: the logit is 4 (a - 0.5).
@@ -165,7 +165,7 @@ def test_what_tells_right_from_wrong_weighs_and_the_rest_does_not():
     assert (found.names, found.scales) == (START.names, START.scales)
 
 
-def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
+def test_fit_logistic_with_a_strong_prior_changes_only_the_bias():
     rows, right = rows_of(200)
     start = fit_logistic(START, *rows_of(2000, seed=2), np.ones(2000), 1.0)
     found = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
@@ -175,7 +175,7 @@ def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
     assert held.bias == pytest.approx(start.bias, abs=0.01)
 
 
-def test_the_part_that_shows_ground_moves_with_the_picture():
+def test_change_picture_moves_the_mask_with_the_image():
     image = textured(4)
     shown = np.zeros(image.shape, bool)
     shown[:, 80:] = True

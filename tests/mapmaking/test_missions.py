@@ -38,18 +38,18 @@ def written(tmp_path, said):
     return path
 
 
-def test_a_waypoint_file_gives_what_is_flown_to_and_nothing_else(tmp_path):
+def test_read_area_reads_only_flown_waypoints_of_a_waypoint_file(tmp_path):
     area = read_area(written(tmp_path, WAYPOINTS))
     assert area.path == (Waypoint(50.001, 11.9), Waypoint(50.002, 11.901, 60.0), Waypoint(50.003, 11.903, 70.0))
     assert area.extent_deg == pytest.approx((50.001, 11.9, 50.003, 11.903))
 
 
-def test_a_plan_gives_its_waypoints_and_its_survey(tmp_path):
+def test_read_area_reads_waypoints_and_survey_of_a_plan(tmp_path):
     area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": ITEMS}}))
     assert area.path == (Waypoint(50.0, 11.9, 50.0), Waypoint(50.001, 11.9, 80), Waypoint(50.009, 11.9, 80))
 
 
-def test_a_plan_gives_the_outline_of_a_structure_scan(tmp_path):
+def test_read_area_reads_the_outline_of_a_structure_scan(tmp_path):
     scan = {"type": "ComplexItem", "complexItemType": "StructureScan", "polygon": [[50.0, 11.9], [50.01, 11.9]]}
     area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": [scan]}}))
     assert area.path == (Waypoint(50.0, 11.9), Waypoint(50.01, 11.9), Waypoint(50.0, 11.9))
@@ -78,12 +78,12 @@ def _plan_of(point):
         _plan_of("[1" + 400 * "0" + ", 50]"),
     ],
 )
-def test_what_cannot_be_understood_is_said_in_a_sentence(tmp_path, said):
+def test_read_area_refuses_an_invalid_mission_in_one_sentence(tmp_path, said):
     with pytest.raises(UsageError, match="save"):
         read_area(written(tmp_path, said))
 
 
-def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_path):
+def test_read_area_refuses_an_empty_or_invalid_area_and_a_foreign_file(tmp_path):
     for empty in ("QGC WPL 110\n", {"fileType": "Plan", "mission": {"items": []}}):
         with pytest.raises(UsageError, match="no position"):
             read_area(written(tmp_path, empty))
@@ -97,7 +97,7 @@ def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_p
 
 
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), [(50.0, 11.9), (-35.36, 149.16), (-17.0, -179.9999)])
-def test_an_area_may_be_a_circle(lat_deg, lon_deg):
+def test_read_area_accepts_a_circle(lat_deg, lon_deg):
     area = read_area(f"{lat_deg}, {lon_deg},500")
     ground = area.project_ground(lambda lats_deg, lons_deg: offset_m(lat_deg, lon_deg, lats_deg, lons_deg), 20.0, 7.0)
     assert ground.bounds == pytest.approx((-520, -520, 520, 520))

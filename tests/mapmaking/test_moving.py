@@ -54,7 +54,7 @@ def places_of(path, numbers=None):
         return list(place_map.read_places(numbers))
 
 
-def test_every_position_is_moved_by_what_the_flight_found_last(path, capsys):
+def test_move_map_moves_each_position_by_the_last_survey_of_the_flight(path, capsys):
     log = log_of(path, FOUND | {"off_m": [99.0, 0.0]}, FOUND)
     before = places_of(path)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
@@ -70,7 +70,7 @@ def test_every_position_is_moved_by_what_the_flight_found_last(path, capsys):
     assert after[2].position is None
 
 
-def test_a_scale_is_taken_back_around_the_middle_of_the_flight(path, capsys):
+def test_move_map_corrects_the_scale_around_the_middle_of_the_flight(path, capsys):
     log = log_of(path, FOUND | {"scale": 0.01})
     assert run_json(capsys, "map", "move", path, "--by", log)["scale"] == 0.01
     first, second, _ = places_of(path)
@@ -79,7 +79,7 @@ def test_a_scale_is_taken_back_around_the_middle_of_the_flight(path, capsys):
     assert first.pose.footprint_m == pytest.approx(130 / 1.01)
 
 
-def test_the_same_log_moves_a_map_once(path):
+def test_move_map_applies_a_log_only_once(path):
     log = log_of(path, FOUND)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
     with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match="moved since"):
@@ -87,14 +87,14 @@ def test_the_same_log_moves_a_map_once(path):
 
 
 @pytest.mark.parametrize("lines", [(), (SURVEY | FOUND | {"off_m": None, "off_sd": None},), (FOUND, SURVEY)])
-def test_a_log_that_does_not_say_where_the_map_lies_moves_nothing(path, lines, capsys):
+def test_move_map_moves_nothing_without_a_survey(path, lines, capsys):
     log, before = log_of(path, *lines), places_of(path)
     assert main(["map", "move", str(path), "--by", str(log)]) != 0
     assert "no measured map offset" in capsys.readouterr().err
     assert places_of(path) == before
 
 
-def test_a_damaged_place_stops_the_whole_move(path):
+def test_move_map_moves_nothing_if_a_place_is_damaged(path):
     with PlaceMap.open_for_writing(path) as place_map, place_map.transaction():
         place_map.db.execute("UPDATE places SET heading_deg = 'north' WHERE place_id = 2")
     log, before = log_of(path, FOUND), places_of(path, [1])

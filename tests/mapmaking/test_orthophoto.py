@@ -50,7 +50,7 @@ def require_marks(picture: np.ndarray, footprint_m: float = FOOTPRINT_M, within_
         ("+proj=tmerc +lat_0=50 +lon_0=9 +datum=WGS84 +units=us-ft", 0),
     ],
 )
-def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, rotation_deg):
+def test_cut_places_marks_correctly_with_true_north_up(tmp_path, crs, rotation_deg):
     picture, valid = cut(marked_raster(tmp_path / "o.tif", crs, rotation_deg=rotation_deg, side_px=720))
     assert picture.shape == (SIDE_PX, SIDE_PX, 3)
     assert picture.dtype == np.uint8
@@ -62,7 +62,7 @@ def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, rotation_
 @pytest.mark.parametrize(
     ("crs", "west"), [("EPSG:4326", 179.999), ("EPSG:4326", -180.001), ("EPSG:3857", 20037398.0), ("EPSG:32660", None)]
 )
-def test_a_file_over_the_antimeridian_is_one_picture(tmp_path, crs, west):
+def test_orthophoto_reads_a_file_across_the_antimeridian(tmp_path, crs, west):
     (x,), (y,) = transform("EPSG:4326", crs, [179.999], [-17.0])
     pixel = 1e-5 if crs == "EPSG:4326" else 1.1
     to_crs = rasterio.Affine(pixel, 0, x if west is None else west, 0, -pixel, y + 100 * pixel)
@@ -84,7 +84,7 @@ def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place
     require_marks(picture, within_px=0.2)
 
 
-def test_what_lies_beyond_the_edge_has_no_data(tmp_path):
+def test_cut_masks_ground_beyond_the_edge(tmp_path):
     path = marked_raster(tmp_path / "o.tif")  # 160 m wide
     orthophoto = Orthophoto(path)
     _, valid = orthophoto.cut(HOME, 320.0, SIDE_PX)
@@ -114,7 +114,7 @@ def spread(kind: str, bright: np.ndarray) -> tuple[np.ndarray, dict]:
 
 
 @pytest.mark.parametrize("kind", ["grey", "alpha", "grey and alpha", "near infrared", "nodata"])
-def test_every_form_of_file_is_read(tmp_path, kind):
+def test_orthophoto_reads_each_file_format(tmp_path, kind):
     to_crs, east_m, north_m = grid("EPSG:32632", 0.25, 640)
     bands, profile = spread(kind, marked(east_m, north_m))
     picture, valid = cut(write_raster(tmp_path / "o.tif", bands, "EPSG:32632", to_crs, **profile))
@@ -137,7 +137,7 @@ def refused(path) -> str:
     return str(caught.value)
 
 
-def test_what_is_no_orthophoto_is_refused_in_a_sentence(tmp_path):
+def test_orthophoto_refuses_other_files_in_one_sentence(tmp_path):
     to_crs, east_m, north_m = grid("EPSG:32632", 1.0, 64)
     bright = marked(east_m, north_m)
     byte = bright.astype(np.uint8)[None]
@@ -162,7 +162,7 @@ def test_what_is_no_orthophoto_is_refused_in_a_sentence(tmp_path):
     assert "palette" in refused(palette)
 
 
-def test_a_file_that_ends_early_is_no_crash(tmp_path):
+def test_cut_refuses_a_truncated_file(tmp_path):
     path = marked_raster(tmp_path / "o.tif")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
@@ -170,7 +170,7 @@ def test_a_file_that_ends_early_is_no_crash(tmp_path):
         Orthophoto(path).cut(HOME, 120.0, SIDE_PX)
 
 
-def test_the_edge_of_the_data_draws_no_dark_line(tmp_path):
+def test_cut_draws_no_dark_line_at_the_edge_of_the_data(tmp_path):
     to_crs, _, _ = grid("EPSG:32632", 0.13, 800)
     picture = np.full((1, 800, 800), 150, np.uint8)
     picture[..., :400] = 0

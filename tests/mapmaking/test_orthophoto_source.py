@@ -54,7 +54,7 @@ def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
     assert len(lattice) == np.prod(lattice.shape)
 
 
-def test_a_frame_says_where_it_lies_and_how_large_it_is(tmp_path):
+def test_frames_have_position_and_footprint(tmp_path):
     source = source_of(marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400), 80.0, 60.0)
     frames = frames_of(source)
     assert source.total == 9 == len(frames)
@@ -84,7 +84,7 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     assert 0.3 < len(frames_of(turned)) / turned.total < 0.7
 
 
-def test_an_area_keeps_what_lies_near_its_path(tmp_path):
+def test_make_lattice_keeps_places_near_the_path_of_the_area(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
     way = Area(path=(waypoint(-100, -50), waypoint(50, 100), waypoint(50, 150)))
     points_m = off_m(make_lattice(Orthophoto(path), 25.0, 5.0, way))
@@ -110,13 +110,13 @@ def test_an_area_keeps_what_lies_near_its_path(tmp_path):
         (80, 0.01, "give --spacing-m 1, or"),
     ],
 )
-def test_a_grid_that_makes_no_sense_is_refused(tmp_path, footprint_m, spacing_m, said):
+def test_make_lattice_refuses_an_invalid_grid(tmp_path, footprint_m, spacing_m, said):
     orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
     with pytest.raises(UsageError, match=said):
         make_lattice(orthophoto, footprint_m, spacing_m)
 
 
-def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
+def test_make_lattice_refuses_an_area_elsewhere_with_both_extents(tmp_path):
     orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
     for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
         with pytest.raises(
@@ -128,7 +128,7 @@ def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
             make_lattice(orthophoto, 0.5, 10.0, Area(path=(waypoint(off_m, 15.5),)))
 
 
-def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):
+def test_make_lattice_keeps_grid_and_names_within_an_area(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
     every = {frame.name: frame.position for frame in frames_of(source_of(path, 80.0, 30.0))}
     some = frames_of(source_of(path, 80.0, 30.0, Area(path=(waypoint(60, 60),))))
@@ -149,7 +149,7 @@ def test_places_under_cloud_are_counted(tmp_path):
     assert (len(frames), source.counts["white"]) == (16, 4)
 
 
-def test_one_order_cuts_every_place_at_several_footprints(tmp_path):
+def test_orthophoto_source_cuts_each_place_at_several_footprints(tmp_path):
     path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
     source = OrthophotoGrid(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()
     frames = frames_of(source)

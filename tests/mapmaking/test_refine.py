@@ -89,7 +89,7 @@ def errors_m(place_map, poses):
     return np.array(off_m), np.array(rotation_deg)
 
 
-def test_refine_moves_places_to_where_their_pictures_lie(flown, map_path, capsys):
+def test_refine_moves_places_to_the_true_positions_of_their_images(flown, map_path, capsys):
     _, poses = flown
     with PlaceMap.open(map_path) as place_map:
         before_m, _ = errors_m(place_map, poses)
@@ -125,7 +125,7 @@ def test_refine_notices_exchanged_lat_and_lon_and_a_lost_sign(map_path, capsys, 
     assert (refined["refined"], refined["is_mirrored"]) == (0, True)
 
 
-def test_refine_begins_again_with_what_was_recorded(map_path, capsys):
+def test_refine_restarts_from_the_recorded_positions(map_path, capsys):
     def positions():
         with PlaceMap.open(map_path) as place_map:
             return [(place.position, place.pose) for place in place_map.read_places()]
@@ -190,7 +190,7 @@ def test_refine_refines_maps_of_any_kind_as_far_as_they_can_be(
 
 
 @pytest.mark.data
-def test_refine_ties_pictures_by_votes_where_landmarks_are_missing(tmp_path):
+def test_refine_ties_images_by_votes_without_landmarks(tmp_path):
     folder = _DATA / "aerial_garfield28"
     if not folder.is_dir():
         pytest.skip("the pictures are not here")
@@ -209,7 +209,7 @@ def test_refine_ties_pictures_by_votes_where_landmarks_are_missing(tmp_path):
     assert found.ties > 65, "of a hundred pairs many overlap by a strip only"
 
 
-def test_refine_leaves_places_of_a_surveyed_picture(built, tmp_path):
+def test_refine_leaves_surveyed_places_unchanged(built, tmp_path):
     with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
         lies = Pose(up_deg=0.0, footprint_m=80.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
         (first, *_) = there.read_places([1])
@@ -221,14 +221,14 @@ def test_refine_leaves_places_of_a_surveyed_picture(built, tmp_path):
     assert place.pose == lies
 
 
-def test_map_refine_says_why_a_map_cannot_be_refined(tmp_path, flown, map_path, capsys):
+def test_map_refine_explains_why_a_map_cannot_be_refined(tmp_path, flown, map_path, capsys):
     path = tmp_path / "hog.gpkg"
     assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
     assert "refined:" not in capsys.readouterr().out, "a map of another kind is built as it was"
     assert "--camera nadir" in refused(capsys, "map", "refine", path)
 
 
-def test_refine_leaves_a_place_that_cannot_be_read(map_path):
+def test_refine_skips_an_unreadable_place(map_path):
     write_sql(
         map_path,
         "UPDATE places SET landmarks = x'00' WHERE place_id = 3",

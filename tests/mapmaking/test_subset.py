@@ -59,7 +59,7 @@ def path_over(*points):
 
 
 @pytest.mark.parametrize("of_one", [True, False])
-def test_places_along_a_path_are_taken_from_the_maps_that_they_are_in(tiles, whole, tmp_path, of_one):
+def test_make_subset_copies_places_along_a_path_from_several_maps(tiles, whole, tmp_path, of_one):
     found = make_subset(
         whole if of_one else tiles, path_over((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, iterate_silently
     )
@@ -73,7 +73,7 @@ def test_subset_reads_only_the_maps_near_the_mission(tiles, tmp_path):
     assert (found.maps, names_in(tmp_path / "f.gpkg")) == (1, [f"0{row}" for row in range(SIDE)])
 
 
-def test_places_in_a_circle_are_taken(tiles, tmp_path):
+def test_make_subset_copies_places_within_a_circle(tiles, tmp_path):
     circle = Area((Waypoint(*at(100, 200)),), radius_m=130.0)
     make_subset(tiles, circle, 20.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(3) for r in range(1, 4)}
@@ -81,7 +81,7 @@ def test_places_in_a_circle_are_taken(tiles, tmp_path):
     assert "32" in names_in(tmp_path / "g.gpkg")
 
 
-def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path):
+def test_make_subset_within_a_budget_keeps_the_places_with_the_smallest_gaps(tiles, tmp_path):
     area = path_over((0, 0), (400, 400))
     whole = make_subset(tiles, area, 1000.0, tmp_path / "whole.gpkg", None, iterate_silently)
     found = make_subset(tiles, area, 1000.0, tmp_path / "f.gpkg", whole.file_bytes / 2, iterate_silently)
@@ -92,7 +92,7 @@ def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path)
     assert not (tmp_path / "g.gpkg").exists()
 
 
-def test_map_subset_of_several_calibrated_maps_is_not_calibrated_and_says_so(tiles, tmp_path, capsys):
+def test_map_subset_of_several_calibrated_maps_reports_that_it_is_not_calibrated(tiles, tmp_path, capsys):
     shutil.copytree(tiles, tmp_path / "tiles")
     for path in (tmp_path / "tiles").iterdir():
         with PlaceMap.open_for_writing(path) as place_map:
@@ -107,7 +107,7 @@ def test_map_subset_of_several_calibrated_maps_is_not_calibrated_and_says_so(til
         out.unlink()
 
 
-def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
+def test_make_subset_refuses_invalid_requests_and_leaves_no_file(tiles, tmp_path):
     with pytest.raises(UsageError, match=r"No place of .* is within 50 m of the mission"):
         make_subset(tiles, path_over((5000, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
     with pytest.raises(MapError, match="contains no map"):

@@ -37,13 +37,13 @@ def fly(ground, pitch_deg, count=24):
 
 
 @pytest.mark.parametrize("pitch_deg", [30, 45])
-def test_measure_tilt_finds_a_camera_that_looks_ahead(ground, pitch_deg):
+def test_measure_tilt_finds_a_camera_that_faces_ahead(ground, pitch_deg):
     tilt = measure_tilt(fly(ground, pitch_deg))
     assert tilt.pairs >= MIN_PAIRS
     assert MAX_UNKNOWN_TILT_DEG < tilt.deg < pitch_deg + 8
 
 
-def test_measure_tilt_finds_none_of_a_camera_that_looks_straight_down(ground):
+def test_measure_tilt_is_zero_for_a_camera_that_faces_straight_down(ground):
     tilt = measure_tilt(fly(ground, 0))
     assert tilt is None or tilt.deg < 8
 
@@ -58,7 +58,7 @@ def test_require_level_refuses_a_tilted_camera_whose_angles_are_not_recorded(gro
     require_level_camera(pictures, None)
 
 
-def test_measure_tilt_says_nothing_of_images_that_do_not_overlap():
+def test_measure_tilt_is_unknown_without_overlap():
     rng = np.random.default_rng(3)
     images = rng.integers(0, 255, (20, 240, 320), np.uint8)
     assert measure_tilt(images) is None

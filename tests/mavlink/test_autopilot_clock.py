@@ -33,7 +33,7 @@ def next_sent(autopilot, name):
     return None
 
 
-def test_stamps_are_the_autopilots_own_time_or_ours_for_a_px4_which_converts_them():
+def test_timestamps_are_in_autopilot_time_or_for_px4_in_ours():
     autopilot = streaming(Channel.COMMAND)
     autopilot.put_fix()
     (fix,) = [message for message in autopilot.take_sent() if message.get_type() == "COMMAND_INT"]
@@ -44,7 +44,7 @@ def test_stamps_are_the_autopilots_own_time_or_ours_for_a_px4_which_converts_the
     assert odometry.time_usec == pytest.approx(now_s * 1e6, abs=100)
 
 
-def test_gps_input_carries_its_time_since_boot_and_its_utc_without_the_jitter_of_the_link():
+def test_gps_input_has_boot_time_and_utc_without_link_jitter():
     autopilot = streaming(Channel.GPS_INPUT, lag_s=0.2)
     position, now_s = next_sent(autopilot, "GPS_INPUT")
     assert position.time_usec == pytest.approx((now_s - 600.2) * 1e6, abs=100)
@@ -60,7 +60,7 @@ def test_gps_input_carries_its_time_since_boot_and_its_utc_without_the_jitter_of
 
 
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT, Channel.ODOMETRY])
-def test_nothing_with_a_stamp_is_sent_before_the_time_is_known_or_not_answered_for_five_seconds(channel, caplog):
+def test_link_sends_no_timestamps_without_a_recent_time_from_the_autopilot(channel, caplog):
     name = {Channel.COMMAND: "COMMAND_INT", Channel.GPS_INPUT: "GPS_INPUT", Channel.ODOMETRY: "ODOMETRY"}[channel]
     autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=Ear())
     sent_after_s = []
@@ -90,7 +90,7 @@ def learnt(*trips, start_s=1000.0):
     return clock
 
 
-def test_the_shortest_round_trip_counts_for_ten_seconds():
+def test_boot_time_s_uses_the_shortest_round_trip_of_ten_seconds():
     slow, quick = (0.4, 0.01), (0.004, 0.002)
     assert learnt(slow).boot_time_s(1000.0) == pytest.approx(400.195)
     assert learnt(slow, quick, slow).boot_time_s(1000.0) == pytest.approx(400.001)
@@ -98,7 +98,7 @@ def test_the_shortest_round_trip_counts_for_ten_seconds():
     assert AutopilotClock().boot_time_s(1.0) is None
 
 
-def test_an_answer_that_we_have_not_asked_for_is_ignored():
+def test_handle_ignores_an_unrequested_answer():
     clock = AutopilotClock()
     request = clock.make_request(1000.0)
     for tc1, ts1 in ((5 * 10**9, request.ts1 + 1), (0, request.ts1), (-5, request.ts1), (2**62, 0)):
@@ -109,7 +109,7 @@ def test_an_answer_that_we_have_not_asked_for_is_ignored():
     assert autopilot.conversation.autopilot.clock.boot_time_s(1000.0) is None, "answered by another component"
 
 
-def test_an_answer_that_contradicts_older_ones_replaces_them():
+def test_handle_replaces_older_answers_that_a_new_one_contradicts():
     """As after a pause of a simulated autopilot, or of our computer."""
     clock = learnt((0.001, 0.001), (0.001, 0.001))
     request = clock.make_request(1002.0)
@@ -127,7 +127,7 @@ def test_an_answer_that_contradicts_older_ones_replaces_them():
         (WRAP_MS - 500, 500, False),
     ],
 )
-def test_a_boot_time_that_goes_back_is_that_of_another_boot_but_for_its_wrap(first_ms, then_ms, has_restarted):
+def test_handle_recognises_another_boot_by_a_decreasing_boot_time_except_at_its_wrap(first_ms, then_ms, has_restarted):
     clock = AutopilotClock()
     assert not clock.handle(mavlink.MAVLink_attitude_message(first_ms, 0, 0, 0, 0, 0, 0), 1000.0)
     assert not clock.handle(mavlink.MAVLink_system_time_message(0, then_ms), 1001.0), "each kind has its own"
@@ -144,7 +144,7 @@ def foreign(kind, stamp_s):
 
 
 @pytest.mark.parametrize("kind", ["LANDING_TARGET", "VISION_POSITION_ESTIMATE", "43003"])
-def test_stamps_of_others_that_are_not_in_the_autopilots_time_are_reported_once(kind, caplog):
+def test_timestamps_of_others_in_another_time_base_are_reported_once(kind, caplog):
     autopilot = Autopilot(booted_s=600.0)
     autopilot.say(foreign(kind, autopilot.boot_s - 0.4), component_id=191)
     autopilot.say(foreign(kind, 1.7e9), component_id=1)
@@ -214,7 +214,7 @@ class LinkOfArduPilot:
 
 @pytest.mark.parametrize("age_s", [0.0, 0.3, 1.2])
 @pytest.mark.parametrize("foreign_s", [None, 1.7e9])
-def test_put_back_gives_ardupilot_the_position_of_the_time_by_which_it_counts(age_s, foreign_s):
+def test_put_back_sends_ardupilot_the_position_at_its_assumed_delay(age_s, foreign_s):
     """The vehicle flies north at 20 m/s; what counts is where a fix lies beside the vehicle at the time of the fix."""
     autopilot, link = streaming(Channel.COMMAND), LinkOfArduPilot()
     north_deg = 20.0 / 111_195

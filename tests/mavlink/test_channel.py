@@ -20,7 +20,7 @@ ARDUPILOT = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
 PX4 = mavlink.MAV_AUTOPILOT_PX4
 
 
-def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
+def test_choose_ardupilot_channel_uses_our_receiver_and_its_configured_delay():
     second = choose_ardupilot_channel(VehicleKind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
     assert (second.receiver, second.lag_s) == (1, 0.2)
     needed = choose_ardupilot_channel(VehicleKind.COPTER, {"GPS1_TYPE": 1}).reason
@@ -50,7 +50,7 @@ def sent(autopilot, name, seconds=1.0):
     return messages
 
 
-def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second():
+def test_copter_with_our_receiver_gets_ten_positions_a_second():
     autopilot, ear = interviewed(GPS2_TYPE=14)
     assert ear.channels == [Channel.NONE, Channel.GPS_INPUT]
     positions = sent(autopilot, "GPS_INPUT", 2.0)
@@ -67,7 +67,7 @@ def test_a_copter_with_our_receiver_gets_a_position_ten_times_a_second():
     assert autopilot.position().has_gps
 
 
-def test_odometry_waits_for_an_origin_and_sets_one_where_it_may():
+def test_odometry_waits_for_an_origin_and_sets_one_if_allowed():
     autopilot, ear = interviewed(VISO_TYPE=1, EK3_SRC2_POSXY=6, origin=Position(46.5, 7.5, 400.0))
     assert ear.channels == [Channel.NONE, Channel.ODOMETRY]
     assert sent(autopilot, "ODOMETRY", 2.0) == []
@@ -81,7 +81,7 @@ def test_odometry_waits_for_an_origin_and_sets_one_where_it_may():
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 2
 
 
-def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
+def test_origin_without_altitude_uses_the_pressure_altitude():
     autopilot, ear = interviewed(VISO_TYPE=1, seconds=6, origin=Position(46.5, 7.5))
     asked = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
     for _ in range(4):
@@ -110,7 +110,7 @@ def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
         assert sent(autopilot, "ODOMETRY")[-1].z == pytest.approx(-116.0, abs=0.01)
 
 
-def test_what_the_accelerometers_feel_is_heard_with_the_attitude():
+def test_conversation_reads_accelerations_together_with_the_attitude():
     autopilot, ear = interviewed()
     autopilot.say(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
     assert ear.forces == []
@@ -121,7 +121,7 @@ def test_what_the_accelerometers_feel_is_heard_with_the_attitude():
     assert roll_deg == pytest.approx(28.65, abs=0.01)
 
 
-def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_known():
+def test_px4_gets_ten_positions_a_second_and_none_if_unknown():
     autopilot, ear = interviewed(PX4)
     said = sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0)
     assert len(said) == pytest.approx(30, abs=1)
@@ -130,7 +130,7 @@ def test_a_px4_is_sent_a_position_ten_times_a_second_and_nothing_where_none_is_k
     assert sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0) == []
 
 
-def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position_beside_it():
+def test_px4_with_odometry_is_asked_for_its_origin_and_sent_positions_relative_to_it():
     autopilot, _ = interviewed(PX4, EKF2_AGP0_CTRL=0, EKF2_EV_CTRL=1, origin=Position(46.5, 7.5, 400.0))
     assert sent(autopilot, "ODOMETRY", 3.0) == []
     assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
@@ -160,7 +160,7 @@ GLOBAL = mavlink.EKF_POS_HORIZ_ABS
 FUSES = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 
-def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
+def test_px4_receiver_that_is_not_used_does_not_count_as_gps():
     """With EKF2_GPS_CTRL=0 the receiver goes on, near where the aircraft is."""
     autopilot, ear = interviewed(PX4)
     ear.state = None
@@ -183,7 +183,7 @@ def test_a_receiver_that_a_px4_does_not_use_is_no_gps():
     assert not has_gps_after(3, GLOBAL | FUSES), "what it fuses is ours"
 
 
-def test_between_matches_a_fix_is_sent_where_none_has_been_for_half_a_second():
+def test_conversation_sends_a_fix_between_matches_after_half_a_second():
     autopilot, ear = interviewed()
     assert sent(autopilot, "COMMAND_INT", 3.0) == []
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)

@@ -60,7 +60,7 @@ def loses(share, seed=1):
     return lambda message: dice.random() < share
 
 
-def test_questions_end_with_all_parameters_known():
+def test_selector_requests_end_once_all_parameters_are_known():
     autopilot = Asked(COPTER)
     assert autopilot.answer_for(10, Channel.GPS_INPUT) < 5
     autopilot.answer_for(10)
@@ -69,7 +69,7 @@ def test_questions_end_with_all_parameters_known():
     assert not known.intersection(OLD_NAMES.values())
 
 
-def test_questions_are_ten_at_most_and_come_after_growing_pauses_while_nothing_is_answered():
+def test_selector_requests_at_most_ten_at_growing_intervals_without_answers():
     autopilot = Asked(COPTER, is_lost=lambda message: True)
     autopilot.answer_for(300)
     count = Counter(t_s for t_s, _ in autopilot.requests)
@@ -89,7 +89,7 @@ def test_answers_after_eight_seconds_of_silence_choose_the_channel():
 
 
 @pytest.mark.parametrize("firmware", ["old", "without vision"])
-def test_parameters_that_it_does_not_have_are_absent_after_some_rounds(firmware):
+def test_parameters_that_the_autopilot_lacks_are_absent_after_some_rounds(firmware):
     parameters = {name: value for name, value in COPTER.items() if not name.startswith("VISO")}
     if firmware == "old":
         parameters = {OLD_NAMES.get(name, name): value for name, value in parameters.items()}
@@ -99,14 +99,14 @@ def test_parameters_that_it_does_not_have_are_absent_after_some_rounds(firmware)
     assert autopilot.answer_for(30, Channel.GPS_INPUT) < 15
 
 
-def test_a_parameter_that_does_not_exist_is_absent_at_once():
+def test_selector_treats_a_nonexistent_parameter_as_absent_at_once():
     px4 = {name: value for name, value in PX4.items() if "AGP" not in name}
     autopilot = Asked(px4, mavlink.MAV_AUTOPILOT_PX4, errors=True)
     assert autopilot.answer_for(10, Channel.COMMAND) < 2
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
-def test_a_parameter_whose_answers_are_lost_is_not_absent(share):
+def test_selector_does_not_treat_a_parameter_with_lost_answers_as_absent(share):
     """What is asked for in vain is on a link that loses as much else no proof that it is not there."""
     for seed in range(5):
         autopilot = Asked(COPTER | {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, is_lost=loses(share, seed))
@@ -116,7 +116,7 @@ def test_a_parameter_whose_answers_are_lost_is_not_absent(share):
         assert not [message for message in autopilot.sent if message.get_type() == "GPS_INPUT"]
 
 
-def test_missing_answers_are_reported_once_and_withhold_fixes():
+def test_selector_reports_missing_answers_once_and_withholds_fixes():
     autopilot = Asked(COPTER, is_lost=lambda message: message.param_id not in ("GPS1_TYPE", "AHRS_EKF_TYPE"))
     autopilot.answer_for(1)
     autopilot.link["is_lost"] = lambda message: True
@@ -132,7 +132,7 @@ def test_missing_answers_are_reported_once_and_withhold_fixes():
     assert (Severity.INFO, "edgevpr: positions sent via GPS_INPUT") in autopilot.sentences()
 
 
-def test_a_dangerous_change_in_flight_stops_the_channel_at_once_and_its_end_starts_it():
+def test_selector_stops_the_channel_while_a_parameter_is_dangerous():
     autopilot = Asked(COPTER)
     autopilot.answer_for(10)
     autopilot.set(GPS_PRIMARY=1)
@@ -147,7 +147,7 @@ def test_a_dangerous_change_in_flight_stops_the_channel_at_once_and_its_end_star
     assert autopilot.conversation.channel is Channel.GPS_INPUT
 
 
-def test_a_change_that_is_not_broadcast_is_noticed_within_two_minutes():
+def test_selector_notices_an_unannounced_change_within_two_minutes():
     autopilot = Asked(COPTER)
     autopilot.answer_for(10)
     autopilot.parameters["EK3_AFFINITY"] = 1
@@ -157,14 +157,14 @@ def test_a_change_that_is_not_broadcast_is_noticed_within_two_minutes():
     assert len(autopilot.requests) == pytest.approx(10, abs=1)
 
 
-def test_what_makes_us_weak_is_reported_once():
+def test_selector_reports_a_weak_parameter_once():
     autopilot = Asked(PX4 | {"EKF2_GPS_CTRL": 0}, mavlink.MAV_AUTOPILOT_PX4)
     autopilot.answer_for(120)
     assert autopilot.conversation.channel is Channel.SENSOR
     assert autopilot.sentences() == [(Severity.WARNING, "edgevpr: set EKF2_GPS_CTRL=7: see the log")]
 
 
-def test_an_unknown_firmware_keeps_the_command_at_once():
+def test_selector_uses_the_command_at_once_with_unknown_firmware():
     autopilot = Asked({}, mavlink.MAV_AUTOPILOT_GENERIC)
     autopilot.answer_for(60)
     assert autopilot.conversation.channel is Channel.COMMAND

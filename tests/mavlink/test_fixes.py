@@ -40,7 +40,7 @@ def hear(fixes, result, t_s):
     return fixes.handle(result, Readiness(has_gps=True).explain(result), t_s)
 
 
-def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
+def test_fixes_get_their_own_answers_at_one_a_second_despite_losses(fixes):
     sendings = []
     for t_s in range(10):
         sendings.append(sent(fixes, t_s))
@@ -53,7 +53,7 @@ def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
     assert (fixes.unanswered, len(fixes), fixes.refusal) == (2, 0, GPS_IN_USE)
 
 
-def test_an_answer_that_is_late_or_one_too_many_belongs_to_no_fix(fixes):
+def test_fixes_ignore_late_and_extra_answers(fixes):
     first, second, third = (sent(fixes, t_s) for t_s in (-3.0, -2.8, -2.6))
     assert hear(fixes, "FAILED", -2.5) is first
     assert hear(fixes, "ACCEPTED", -2.4) is second
@@ -67,7 +67,7 @@ def test_an_answer_that_is_late_or_one_too_many_belongs_to_no_fix(fixes):
     assert fixes.unanswered == 1
 
 
-def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
+def test_fixes_may_affect_the_position_unless_refused(fixes):
     assert fixes.t_fix_s == -math.inf
     sent(fixes, 10.0)
     assert fixes.t_fix_s == 10.0, "it may be taken before the answer comes"
@@ -112,14 +112,14 @@ def fly(autopilot, count, every_s=1.0):
     return sendings
 
 
-def test_five_unanswered_fixes_stop_the_sending_and_one_in_ten_seconds_asks_again(autopilot):
+def test_fixes_stop_after_five_unanswered_ones_and_probe_every_ten_seconds(autopilot):
     sendings = fly(autopilot, 40)
     assert [number for number, sending in enumerate(sendings) if sending.sent] == [0, 1, 2, 3, 4, 14, 24, 34]
     assert all(sending.why == UNANSWERED for sending in sendings if not sending.sent)
     assert (autopilot.conversation.sent["COMMAND_INT"], autopilot.conversation.fixes.withheld) == (8, 32)
 
 
-def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(autopilot):
+def test_fixes_do_not_take_late_answers_for_those_to_a_new_fix(autopilot):
     last = fly(autopilot, 6)[4]
     autopilot.wait(0.1)
     autopilot.answer(ACCEPTED)
@@ -133,7 +133,7 @@ def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(au
     assert autopilot.conversation.fixes.unanswered == 5
 
 
-def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
+def test_fixes_refused_report_the_reason_from_the_autopilot_state(autopilot):
     def refused(result=FAILED, after_s=1.0):
         autopilot.wait(after_s)
         autopilot.beat(ARMED)
@@ -161,7 +161,7 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
     assert autopilot.conversation.fixes.refusal.code is ReasonCode.NO_ESTIMATE
 
 
-def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_again(autopilot, caplog):
+def test_fixes_announce_each_reason_once_and_the_next_acceptance(autopilot, caplog):
     caplog.set_level(logging.INFO, "edgevpr.mavlink")
     texts = []
     for result in (ACCEPTED, FAILED, FAILED, DENIED, ACCEPTED, ACCEPTED):
@@ -177,7 +177,7 @@ def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_agai
     assert caplog.text.count("the autopilot's answer") == 4
 
 
-def test_only_answers_of_our_autopilot_to_our_fixes_are_counted(autopilot):
+def test_fixes_count_only_answers_of_our_autopilot_to_us(autopilot):
     autopilot.answer(mavlink.MAV_RESULT_IN_PROGRESS)
     autopilot.answer(99)
     autopilot.answer(ACCEPTED, command=400)
@@ -188,7 +188,7 @@ def test_only_answers_of_our_autopilot_to_our_fixes_are_counted(autopilot):
 
 
 @pytest.mark.parametrize(("answers_commands", "text"), [(False, "signing? system id?"), (True, "no command 43003?")])
-def test_silence_to_five_fixes_says_whether_other_commands_are_answered(autopilot, answers_commands, text):
+def test_fixes_unanswered_report_whether_other_commands_are_answered(autopilot, answers_commands, text):
     autopilot.answer(ACCEPTED, command=511, to=191)
     if answers_commands:
         autopilot.answer(ACCEPTED, command=511)
@@ -227,7 +227,7 @@ def test_explain_returns_the_first_reason_that_applies(result, state, code):
     assert Readiness(**state).explain(result).code is code
 
 
-def test_every_answer_of_an_autopilot_fits_a_status_text():
+def test_fix_answer_summaries_fit_a_status_text():
     codes = list(ReasonCode)
     answers = codes[codes.index(ReasonCode.FIX_ACCEPTED) : codes.index(ReasonCode.FIXES_NOT_ANSWERED) + 1]
     assert len(answers) > 10

@@ -22,7 +22,7 @@ from edgevpr.mavlink.ports import open_port
         ),
     ],
 )
-def test_a_link_is_read_and_written_alike(url, address):
+def test_parse_link_reverses_str(url, address):
     assert parse_link(url) == address
     assert str(address) == url
 
@@ -44,7 +44,7 @@ def test_a_link_is_read_and_written_alike(url, address):
         ("serial:/dev/ttyACM0:0", "57600"),
     ],
 )
-def test_a_malformed_link_gets_one_sentence(url, says):
+def test_parse_link_refuses_a_malformed_link_in_one_sentence(url, says):
     with pytest.raises(LinkAddressError, match=re.escape(says)):
         parse_link(url)
 
@@ -59,7 +59,7 @@ def test_a_malformed_link_gets_one_sentence(url, says):
         "serial:/dev/null:57600",
     ],
 )
-def test_a_wrong_link_is_a_wrong_request_which_a_service_must_not_repeat(link):
+def test_open_port_treats_an_invalid_address_as_a_usage_error(link):
     before = os.listdir("/proc/self/fd")
     with pytest.raises(LinkAddressError) as caught:
         open_port(parse_link(link))
@@ -67,7 +67,7 @@ def test_a_wrong_link_is_a_wrong_request_which_a_service_must_not_repeat(link):
     assert os.listdir("/proc/self/fd") == before, "it is closed"
 
 
-def test_what_may_end_by_itself_is_no_wrong_request():
+def test_open_port_treats_a_passing_fault_as_a_link_error():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         before = os.listdir("/proc/self/fd")

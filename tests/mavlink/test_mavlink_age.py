@@ -67,7 +67,7 @@ def drained(port: socket.socket) -> bytes:
     return got
 
 
-def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_the_connection(line, clock):
+def test_tcp_link_closes_with_an_outdated_fix_in_the_system_buffer(line, clock):
     line, far = line
     hold_up(line)
     fix = sending(clock)
@@ -86,7 +86,7 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     assert b"the fix" not in got, "closing throws away what cannot leave"
 
 
-def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
+def test_serial_link_drops_outdated_fixes_after_a_stall():
     master, slave = pty.openpty()
     tty.setraw(slave)
     peer = Peer(SimpleNamespace(recv=partial(os.read, master), send=partial(os.write, master)), 7)
@@ -115,7 +115,7 @@ def losses_told(caplog) -> int:
     return sum("the device was disconnected" in message for message in told)
 
 
-def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplog):
+def test_serial_link_reopens_a_replugged_cable(tmp_path, caplog):
     cable = SerialCable(tmp_path)
     here, there = (f"serial:{end}:57600" for end in cable.ends)
     with link_to(here) as link:
@@ -136,7 +136,7 @@ def test_an_unplugged_cable_is_found_again_when_it_is_plugged_in(tmp_path, caplo
         assert link.stats().bad_bytes == 0
 
 
-def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tmp_path):
+def test_serial_link_opens_later_if_another_program_probes_the_device(tmp_path):
     """A modem manager opens what is plugged in: at the start that is said, in flight it is waited for."""
     device = tmp_path / "ttyACM0"
     with link_to(f"serial:{device}:57600") as link:

@@ -68,7 +68,7 @@ def near(height_m):
 
 
 @pytest.mark.parametrize("home_m", [GROUND_M, GROUND_M + 60.0, GROUND_M - 7.0])
-def test_height_counts_from_the_ground_wherever_home_is(home_m):
+def test_height_starts_at_the_ground_wherever_home_is(home_m):
     vehicle = Vehicle()
     vehicle.home_m = home_m
     assert vehicle.fly() == 0.0
@@ -80,7 +80,7 @@ def test_height_counts_from_the_ground_wherever_home_is(home_m):
 
 @pytest.mark.parametrize("moved_m", [100.0, 150.0, -60.0, -GROUND_M])
 @pytest.mark.parametrize("climb_m_s", [0.0, 4.0])
-def test_height_stays_when_home_is_set_in_flight(moved_m, climb_m_s):
+def test_height_is_unchanged_if_home_is_set_in_flight(moved_m, climb_m_s):
     vehicle = Vehicle()
     vehicle.take_off()
     vehicle.home_m += moved_m
@@ -91,7 +91,7 @@ def test_height_stays_when_home_is_set_in_flight(moved_m, climb_m_s):
 
 
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 12.0])
-def test_height_stays_when_the_origin_is_set_in_flight(every_s):
+def test_height_is_unchanged_if_the_origin_is_set_in_flight(every_s):
     vehicle = Vehicle()
     vehicle.take_off()
     vehicle.home_m, vehicle.origin_m = vehicle.home_m + 300.0, 300.0
@@ -99,7 +99,7 @@ def test_height_stays_when_the_origin_is_set_in_flight(every_s):
     assert vehicle.texts() == []
 
 
-def test_height_is_known_when_the_position_comes_in_flight():
+def test_height_is_known_if_the_position_arrives_in_flight():
     vehicle = Vehicle()
     vehicle.at_deg = NOWHERE
     assert vehicle.take_off() is None
@@ -107,7 +107,7 @@ def test_height_is_known_when_the_position_comes_in_flight():
     assert vehicle.fly() == near(100.0)
 
 
-def test_a_jump_of_the_altitude_alone_is_left_out_and_doubted():
+def test_height_ignores_an_altitude_jump_and_adds_uncertainty():
     vehicle = Vehicle()
     vehicle.take_off()
     vehicle.origin_m = 40.0
@@ -116,13 +116,13 @@ def test_a_jump_of_the_altitude_alone_is_left_out_and_doubted():
     assert vehicle.texts() == ["altitude jumped +40 m"]
 
 
-def test_height_follows_a_climb_that_the_velocity_does_not_tell():
+def test_height_follows_a_climb_missing_in_the_velocity():
     vehicle = Vehicle()
     vehicle.take_off()
     assert vehicle.fly(20.0, climb_m_s=10.0, vz_cm_s=0, every_s=1.0) == pytest.approx(300.0, abs=11.0)
 
 
-def test_height_of_a_vehicle_first_heard_in_flight_counts_from_home():
+def test_height_of_a_vehicle_first_seen_in_flight_starts_at_home():
     vehicle = Vehicle()
     vehicle.height_m, vehicle.is_armed = 100.0, True
     assert vehicle.fly() == near(100.0)
@@ -130,7 +130,7 @@ def test_height_of_a_vehicle_first_heard_in_flight_counts_from_home():
     assert vehicle.fly() == near(100.0)
 
 
-def test_px4_without_home_is_taken_again_when_it_has_one():
+def test_height_of_a_px4_without_home_is_reset_once_it_has_one():
     vehicle = Vehicle()
     vehicle.height_m, vehicle.is_armed, vehicle.home_m = 100.0, True, 0.0
     vehicle.fly()
@@ -138,14 +138,14 @@ def test_px4_without_home_is_taken_again_when_it_has_one():
     assert vehicle.fly() == near(100.0)
 
 
-def test_a_disarmed_vehicle_that_glides_keeps_its_height():
+def test_height_is_kept_by_a_disarmed_gliding_vehicle():
     vehicle = Vehicle()
     vehicle.take_off()
     vehicle.is_armed = False
     assert vehicle.fly(10.0, climb_m_s=-2.0) == near(80.0)
 
 
-def test_height_over_terrain_does_not_follow_home():
+def test_height_over_terrain_is_independent_of_home():
     vehicle = Vehicle()
     vehicle.terrain_m = GROUND_M
     vehicle.take_off()
@@ -155,7 +155,7 @@ def test_height_over_terrain_does_not_follow_home():
     assert vehicle.fly() == near(70.0)
 
 
-def test_a_range_finder_that_contradicts_for_seconds_is_reported_once():
+def test_height_contradicted_by_the_range_finder_is_reported_once():
     vehicle = Vehicle()
     vehicle.take_off(30.0)
     vehicle.range_m = 37.0

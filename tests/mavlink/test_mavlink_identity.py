@@ -21,7 +21,7 @@ def seconds(first: float, last: float) -> list[float]:
     return [first + count for count in range(round(last - first) + 1)]
 
 
-def test_the_first_autopilot_heard_is_kept_while_it_speaks(caplog):
+def test_identity_keeps_the_first_autopilot_while_it_sends(caplog):
     identity = Identity()
     assert not identity.admits(OURS, False, 0.0), "what is no heartbeat makes nobody ours"
     for t_s in seconds(0, 100):
@@ -35,7 +35,7 @@ def test_the_first_autopilot_heard_is_kept_while_it_speaks(caplog):
     assert caplog.text.count("another autopilot, system 2") == 1
 
 
-def test_the_same_system_from_elsewhere_is_taken_after_thirty_seconds_of_silence(caplog):
+def test_identity_accepts_the_same_system_elsewhere_after_thirty_seconds(caplog):
     identity = Identity()
     beat(identity, Endpoint(1, HERE), 0.0)
     for t_s in seconds(20, 40):
@@ -46,7 +46,7 @@ def test_the_same_system_from_elsewhere_is_taken_after_thirty_seconds_of_silence
     assert beat(identity, Endpoint(1, HERE), 41.0) == [False]
 
 
-def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplog):
+def test_identity_keeps_a_configured_system_at_any_address(caplog):
     identity = Identity(system_id=1)
     assert not any(beat(identity, Endpoint(2, HERE), *seconds(0, 99)))
     assert identity.foreign_messages == 100
@@ -57,7 +57,7 @@ def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplo
     assert identity.current == Endpoint(1, THERE)
 
 
-def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed(autopilot, caplog):
+def test_identity_ignores_a_second_sender_with_the_same_system_id(autopilot, caplog):
     autopilot.conversation.requests.is_flying = True
     autopilot.put_fix()
     for _ in range(40):
@@ -76,7 +76,7 @@ def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed
 
 
 @pytest.mark.parametrize(("system_id", "sent"), [(2, None), (7, True)])
-def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(autopilot, system_id, sent):
+def test_link_sends_no_fix_after_a_reconnection_before_a_heartbeat(autopilot, system_id, sent):
     autopilot.conversation.handle_port_loss(0)
     autopilot.beat(system_id=system_id)
     sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 20.0, autopilot.clock.now_s))

@@ -29,7 +29,7 @@ def text(words: str):
     return make_status_text(Severity.INFO, words)
 
 
-def test_the_heartbeat_comes_once_a_second_with_the_current_health(link, peer, clock):
+def test_link_sends_a_heartbeat_with_the_current_health_each_second(link, peer, clock):
     link.set_health(Health.ACTIVE)
     clock.now_s += 0.9
     link.send(text("not yet"))
@@ -48,7 +48,7 @@ def test_the_heartbeat_comes_once_a_second_with_the_current_health(link, peer, c
     assert peer.expect("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
 
 
-def test_the_link_takes_the_autopilots_system_id_for_its_own_and_addresses_it(link, peer, clock):
+def test_link_uses_and_addresses_the_autopilots_system_id(link, peer, clock):
     link.send(text("before"))
     assert peer.expect("STATUSTEXT").get_srcSystem() == 1
     heard(link, peer)
@@ -60,7 +60,7 @@ def test_the_link_takes_the_autopilots_system_id_for_its_own_and_addresses_it(li
     assert (fix.param1, fix.param2) == (pytest.approx(clock.now_s), 0.5)
 
 
-def test_a_fix_from_an_old_frame_or_to_a_silent_autopilot_is_never_sent(link, peer, clock):
+def test_link_never_sends_an_outdated_fix_or_one_to_a_silent_autopilot(link, peer, clock):
     heard(link, peer)
     link.send_fix(fix_at(clock.now_s - 5.1, 1.0))
     link.send_fix(fix_at(clock.now_s - 4.9, 2.0))
@@ -73,13 +73,13 @@ def test_a_fix_from_an_old_frame_or_to_a_silent_autopilot_is_never_sent(link, pe
     assert not link.stats().autopilot_heard
 
 
-def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, clock, caplog):
+def test_link_drops_only_a_message_whose_value_does_not_fit(link, peer, clock, caplog):
     link.send(*make_named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), text("next"))
     assert [m.name for m in peer.expect_text("next")] == ["vpr_score"]
     assert "NAMED_VALUE_INT" in caplog.text
 
 
-def test_a_sending_link_hears_nobody_but_its_peer(clock):
+def test_udpout_link_accepts_only_its_peer(clock):
     with (
         closing(UdpPort()) as port,
         closing(UdpPort()) as stranger,
@@ -95,7 +95,7 @@ def test_a_sending_link_hears_nobody_but_its_peer(clock):
         assert (stats.received, stats.bad_bytes, stats.foreign_messages) == ({"HEARTBEAT": 1}, 0, 0)
 
 
-def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_not_sent(clock):
+def test_tcp_link_reconnects_to_a_restarted_server_without_old_fixes(clock):
     number = free_port()
     server = TcpServer(number)
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
@@ -122,7 +122,7 @@ def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_
     server.close()
 
 
-def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(clock):
+def test_tcp_link_waits_for_an_absent_server_with_the_newest_messages(clock):
     number = free_port()
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
@@ -136,7 +136,7 @@ def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(cl
     server.close()
 
 
-def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
+def test_tcp_link_is_never_blocked_by_a_peer_that_does_not_read(clock):
     number = free_port()
     server = TcpServer(number)
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
@@ -155,7 +155,7 @@ def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
     server.close()
 
 
-def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
+def test_link_sends_nothing_once_closed_and_can_be_closed_twice(port, clock):
     link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
     link.start()
     link.send(text("last"))
@@ -167,7 +167,7 @@ def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
     link_to("udpout:127.0.0.1:14550").close()  # never started
 
 
-def test_a_closing_link_waits_for_the_answer_to_its_last_fix(link, peer, clock):
+def test_link_waits_for_the_last_answer_while_closing(link, peer, clock):
     heard(link, peer)
     peer.synchronise(link)
     link.send_fix(fix_at(clock()))

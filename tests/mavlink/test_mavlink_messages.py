@@ -34,7 +34,7 @@ def sent_and_received(message: Message) -> Message:
     ("lat_deg", "lon_deg"),
     [(50.12345678, 14.98765432), (-33.8688197, -151.2092955), (89.99999995, 179.99999995), (-90.0, -180.0), (0.0, 0.0)],
 )
-def test_a_fix_arrives_to_a_ten_millionth_of_a_degree_and_without_an_altitude(lat_deg, lon_deg):
+def test_make_position_fix_keeps_seven_decimals_and_no_altitude(lat_deg, lon_deg):
     heard = sent_and_received(messages.make_position_fix(Fix(lat_deg, lon_deg, 25.0, 99.25), 100.5, target_system=7))
     assert heard.get_type() == "COMMAND_INT"
     assert (heard.command, heard.frame) == (43003, mavlink.MAV_FRAME_GLOBAL)
@@ -55,12 +55,12 @@ def test_a_fix_arrives_to_a_ten_millionth_of_a_degree_and_without_an_altitude(la
         ({"t_frame_s": math.nan}, "frame time"),
     ],
 )
-def test_a_fix_that_says_nothing_is_refused(wrong, says):
+def test_fix_refuses_undefined_values(wrong, says):
     with pytest.raises(ValueError, match=says):
         Fix(**{"lat_deg": 50.0, "lon_deg": 14.0, "accuracy_m": 20.0, "t_frame_s": 0.0} | wrong)
 
 
-def test_whole_numbers_and_others_are_named_values_and_what_is_not_known_is_none():
+def test_make_named_values_sends_integers_and_floats_and_omits_unknown_values():
     named = messages.make_named_values(12.5, vpr_place=4711, vpr_score=0.625, vpr_conf=None)
     heard = [(m.get_type(), m.name, m.value, m.time_boot_ms) for m in map(sent_and_received, named)]
     assert heard == [
@@ -71,7 +71,7 @@ def test_whole_numbers_and_others_are_named_values_and_what_is_not_known_is_none
     assert sent_and_received(cpu).time_boot_ms == 1500, "it wraps as its field does"
 
 
-def test_the_computer_tells_load_memory_and_temperature_and_marks_the_rest_as_unknown():
+def test_make_computer_status_reports_load_memory_and_temperature_and_marks_unknown_values():
     heard = sent_and_received(messages.make_computer_status(60.0, [0.5, 1.25, 0.0], 512 << 20, 4096 << 20, 61.4))
     assert heard.cpu_cores == [50, 100, 0, 255, 255, 255, 255, 255]
     assert (heard.ram_usage, heard.ram_total) == (512, 4096)
@@ -92,7 +92,7 @@ def test_the_computer_tells_load_memory_and_temperature_and_marks_the_rest_as_un
         ("ü" * 40, "ü" * 23 + "..."),  # two bytes each: never cut in the middle of a letter
     ],
 )
-def test_a_text_is_cut_to_what_one_message_holds(text, arrives):
+def test_make_status_text_truncates_to_one_message(text, arrives):
     heard = sent_and_received(messages.make_status_text(Severity.WARNING, text))
     assert heard.severity == mavlink.MAV_SEVERITY_WARNING
     assert heard.get_msgbuf()[11:-2].decode() == arrives
@@ -102,13 +102,13 @@ def test_a_text_is_cut_to_what_one_message_holds(text, arrives):
     ("firmware", "filter_report"),
     [(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, [193]), (mavlink.MAV_AUTOPILOT_PX4, [230]), (mavlink.MAV_AUTOPILOT_PPZ, [])],
 )
-def test_a_firmware_is_asked_only_for_the_report_of_its_own_filter(firmware, filter_report):
+def test_make_report_requests_requests_only_the_reports_of_that_firmware(firmware, filter_report):
     asked = {int(each.param1) for each in messages.make_report_requests(1, firmware)}
     assert sorted(asked & {193, 230}) == filter_report
     assert {24, 30, 33, 132, 136} <= asked
 
 
-def test_gps_input_says_position_velocity_and_what_they_are_good_to_or_that_it_has_none():
+def test_make_gps_input_has_position_velocity_and_accuracy_or_no_fix():
     heard = sent_and_received(messages.make_gps_input(STATE, 1, 100.0, 1_700_000_000.25))
     assert (heard.gps_id, heard.fix_type, heard.lat, heard.lon) == (1, 3, 471234567, 87654321)
     assert (heard.ve, heard.vn, heard.vd) == (3.0, -4.0, 0.5)

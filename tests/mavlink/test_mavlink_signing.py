@@ -66,14 +66,14 @@ def unsigned(message=HEARTBEAT) -> bytes:
     return message.pack(mavlink.MAVLink(None, 7, 1))
 
 
-def test_signed_messages_are_admitted_in_their_order_and_once(signing):
+def test_signing_admits_signed_messages_in_order_and_once(signing):
     signer = Signer()
     first, second, third = (signer.packet() for _ in range(3))
     assert admitted(signing, first, third, second, third, first) == [True, True, False, False, False]
     assert signing.refused == {OLD: 3}
 
 
-def test_a_forged_message_from_the_far_future_shuts_out_no_true_one(signing, clock):
+def test_signing_forged_future_timestamp_does_not_block_valid_messages(signing, clock):
     signer = Signer()
     forged = Signer(OTHER_KEY).packet(2**48 - 1)
     assert admitted(signing, signer.packet(), forged, signer.packet()) == [True, False, True]
@@ -84,20 +84,20 @@ def test_a_forged_message_from_the_far_future_shuts_out_no_true_one(signing, clo
 
 
 @pytest.mark.parametrize("place", range(len(Signer().packet())))
-def test_a_message_that_was_changed_anywhere_is_refused(signing, place):
+def test_signing_refuses_a_modified_message(signing, place):
     packet = bytearray(Signer().packet())
     packet[place] ^= 0x10
     assert admitted(signing, packet) == [False]
 
 
-def test_unsigned_messages_are_refused_counted_and_told_once(signing, caplog):
+def test_signing_refuses_counts_and_reports_unsigned_messages_once(signing, caplog):
     old_protocol = HEARTBEAT.pack(mavlink.MAVLink(None, 7, 1), force_mavlink1=True)
     assert not any(admitted(signing, unsigned(), unsigned(), old_protocol))
     assert signing.refused == {UNSIGNED: 3}
     assert caplog.text.count("does not sign") == 1
 
 
-def test_a_radio_status_needs_no_signature_but_must_not_speak_for_the_autopilot(signing):
+def test_signing_accepts_unsigned_radio_status_but_not_as_the_autopilot(signing):
     message = mavlink.MAVLink_radio_status_message(1, 2, 3, 4, 5, 6, 7)
     assert admitted(signing, message.pack(mavlink.MAVLink(None, 51, 68))) == [True]
     assert signing.refused == {}
@@ -110,13 +110,13 @@ def test_a_radio_status_needs_no_signature_but_must_not_speak_for_the_autopilot(
     ("ahead_s", "refused"),
     [(-3600, {OLD: 1}), (-61, {OLD: 1}), (-59, {}), (59, {}), (61, {FUTURE: 1}), (3600, {FUTURE: 1})],
 )
-def test_a_new_stream_must_be_within_a_minute(signing, ahead_s, refused):
+def test_signing_requires_a_new_stream_within_a_minute(signing, ahead_s, refused):
     new = Signer(stamp=NOW + ahead_s * TICKS_S, link_id=1).packet()
     admitted(signing, Signer().packet(), new)
     assert signing.refused == refused
 
 
-def test_the_first_stream_may_be_ahead_and_sets_the_time(signing, clock):
+def test_signing_first_stream_may_be_ahead_and_sets_the_time(signing, clock):
     """A board without a clock chip that was off for a week learns the time from the autopilot."""
     week = 7 * 86_400 * TICKS_S
     assert admitted(signing, Signer(stamp=NOW + week).packet()) == [True]
@@ -136,7 +136,7 @@ def key_file(tmp_path):
 
 
 @pytest.mark.network
-def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch):
+def test_signing_is_compatible_with_pymavlink(key_file, monkeypatch):
     monkeypatch.setenv("MAVLINK20", "1")
     from pymavlink import mavutil
 
@@ -164,7 +164,7 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
 
 
 @pytest.mark.network
-def test_an_autopilot_whose_clock_is_old_learns_the_time_though_another_has_called_before(key_file):
+def test_signing_autopilot_with_an_old_clock_learns_the_time_despite_an_earlier_sender(key_file):
     """As after a flat battery of its clock: it takes ours from the first message that it gets, so it must get one."""
     number, day = free_port(), 86_400 * TICKS_S
     signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
@@ -203,14 +203,14 @@ def received(sock: socket.socket) -> bytes:
     return b""
 
 
-def test_no_fix_goes_to_who_has_not_the_key(signing):
+def test_signing_sends_no_fix_to_an_autopilot_without_the_key(signing):
     autopilot = Autopilot(signing=signing)
     assert autopilot.put_fix().sent is None
     assert signing.refused[UNSIGNED] > 1
     assert autopilot.conversation.reader.received == {}
 
 
-def test_without_a_key_everything_is_admitted_and_nothing_signed():
+def test_signing_without_a_key_admits_everything_and_signs_nothing():
     assert open_signing(MavlinkConfig()) is NOT_SIGNING
     packer = mavlink.MAVLink(None)
     NOT_SIGNING.stamp(packer)
@@ -219,7 +219,7 @@ def test_without_a_key_everything_is_admitted_and_nothing_signed():
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o610, 0o602, 0o440])
-def test_a_key_that_others_may_open_is_refused_also_behind_a_link(key_file, mode):
+def test_read_key_refuses_a_key_that_others_can_read_even_through_a_symlink(key_file, mode):
     link = key_file.with_name("link.key")
     link.symlink_to(key_file)
     for path in (key_file, link):
@@ -230,7 +230,7 @@ def test_a_key_that_others_may_open_is_refused_also_behind_a_link(key_file, mode
             read_key(str(path))
 
 
-def test_a_key_of_another_length_or_that_is_no_file_is_refused(key_file, tmp_path):
+def test_read_key_refuses_a_key_of_another_length_or_type(key_file, tmp_path):
     for content in (b"", KEY[:31], KEY + b"\n"):
         key_file.write_bytes(content)
         with pytest.raises(ConfigError, match="32 bytes"):
@@ -241,7 +241,7 @@ def test_a_key_of_another_length_or_that_is_no_file_is_refused(key_file, tmp_pat
             read_key(str(tmp_path / name))
 
 
-def test_a_credential_of_systemd_is_taken(key_file, monkeypatch):
+def test_read_key_accepts_a_systemd_credential(key_file, monkeypatch):
     """With `User=`, the service reads it by an access list, which shows as the right of its group."""
     key_file.chmod(0o440)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(key_file.parent))

@@ -38,7 +38,7 @@ def test_damaged_packets_and_noise_never_raise_and_are_counted():
     assert len(receiver.received) <= len(packets) + 1  # messages of unknown number share one name
 
 
-def test_any_content_of_the_autopilots_messages_raises_nothing():
+def test_conversation_accepts_any_content_of_autopilot_messages():
     rng, autopilot = random.Random(3), Autopilot()
     for _ in range(10):
         for packet in a_packet_of_every_kind(rng, system_id=7):

@@ -79,7 +79,7 @@ DANGEROUS = [
 
 
 @pytest.mark.parametrize(("parameters", "wrong", "advice"), DANGEROUS)
-def test_decide_stops_the_channel_for_what_is_dangerous(parameters, wrong, advice):
+def test_decide_stops_the_channel_for_a_dangerous_parameter(parameters, wrong, advice):
     decision = decide(parameters | wrong)
     assert decision.choice.channel is Channel.NONE
     why = decision.choice.silence_reason
@@ -109,7 +109,7 @@ WEAK = [
 
 
 @pytest.mark.parametrize(("parameters", "wrong", "advice"), WEAK)
-def test_decide_reports_what_makes_us_useless_and_keeps_the_channel(parameters, wrong, advice):
+def test_decide_reports_a_weak_parameter_and_keeps_the_channel(parameters, wrong, advice):
     decision = decide(parameters | wrong)
     assert decision.choice.channel is decide(parameters).choice.channel
     (why,) = (fault.reason for fault in decision.faults)
@@ -132,18 +132,18 @@ def test_decide_reports_what_makes_us_useless_and_keeps_the_channel(parameters, 
         (SENSOR, {"EKF2_AGP0_CTRL": 3, "EKF2_EV_CTRL": 15, "EKF2_EVP_NOISE": 20.0, "EKF2_GPS_CTRL": 15}),
     ],
 )
-def test_decide_finds_no_fault_in_what_is_harmless(parameters, harmless):
+def test_decide_accepts_harmless_parameters(parameters, harmless):
     decision = decide(parameters | harmless)
     assert (decision.choice.channel, decision.faults) == (decide(parameters).choice.channel, ())
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=lambda table: table.name)
-def test_every_row_has_a_case(table):
+def test_parameter_rules_each_have_a_case(table):
     found = {fault.rule.label for before, wrong, _ in DANGEROUS + WEAK for fault in decide(before | wrong).faults}
     assert {rule.label for rule in table.rules} <= found
 
 
-def test_a_fault_names_a_parameter_as_the_autopilot_does():
+def test_parameter_faults_use_the_names_of_the_autopilot():
     names = {name: OLD_NAMES.get(name, name) for name in SECOND}
     old = {names[name]: value for name, value in SECOND.items()}
     assert decide(old).choice.channel is Channel.GPS_INPUT

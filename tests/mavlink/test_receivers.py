@@ -71,7 +71,7 @@ def test_receiver_without_a_new_fix_is_gone():
     assert without_stamps.choose_best(BEGIN_S + 1.0).t_s == BEGIN_S + 1.0
 
 
-def test_receiver_that_reports_no_speed_or_accuracy_has_a_usual_one():
+def test_receiver_without_speed_or_accuracy_gets_typical_ones():
     assert receive((BEGIN_S, {"speed_m_s": UNKNOWN_SPEED})).choose_best(BEGIN_S).velocity_m_s is None
     for accuracy_m in (0.0, UNKNOWN_ACCURACY_M):
         assert receive((BEGIN_S, {"h_acc_m": accuracy_m})).choose_best(BEGIN_S).sd_m == 5.0

@@ -31,7 +31,7 @@ def read(address, names=(), **autopilot):
         return read_autopilot(link, {"ardupilot": names, "px4": names}), peer
 
 
-def test_all_that_an_autopilot_says_is_read(address):
+def test_request_link_reads_everything_the_autopilot_reports(address):
     parameters = {"GPS1_TYPE": 14, "FS_EKF_THRESH": 0.5, "NO_NUMBER": float("nan")}
     said, peer = read(address, [*parameters, "ABSENT"], messages=healthy_messages(), parameters=parameters, system_id=7)
     assert (said.system_id, said.firmware, said.vehicle) == (7, "ardupilot", "copter")
@@ -48,7 +48,7 @@ def test_all_that_an_autopilot_says_is_read(address):
     assert {message.get_srcComponent() for message in peer.heard} == {197}
 
 
-def test_questions_that_are_lost_are_asked_again(address):
+def test_request_link_repeats_lost_requests(address):
     names = [f"P{number}" for number in range(12)]
     answers = {"messages": healthy_messages(), "parameters": dict.fromkeys(names, 3)}
     with AnsweringAutopilot(address.number, loses=1, **answers), RequestLink(address) as link:
@@ -57,7 +57,7 @@ def test_questions_that_are_lost_are_asked_again(address):
         assert link.request_parameters(names, bytewise=False) == dict.fromkeys(names, 3)
 
 
-def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_stream(address):
+def test_request_link_reads_a_denied_message_from_the_stream(address):
     """As a PX4 does with GPS_RAW_INT."""
     fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 500_000_000, 140_000_000, 0, 80, 120, 0, 0, 14)
     streamed = fix.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
@@ -67,7 +67,7 @@ def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_s
         assert link.request_message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
 
 
-def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, monkeypatch):
+def test_request_link_leaves_out_a_parameter_without_an_answer(address, monkeypatch):
     monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 0.3)
     said, peer = read(address, ["A", "B"], says_unknown=False, messages=healthy_messages(), parameters={"B": 2})
     assert said.parameters == {"B": 2}
@@ -75,19 +75,19 @@ def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, mo
 
 
 @pytest.mark.parametrize("key", [None, bytes(32)])
-def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_signs(address, monkeypatch, key):
+def test_request_link_distinguishes_a_mute_autopilot_from_a_signing_one(address, monkeypatch, key):
     monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 0.1)
     said, _ = read(address, ["A"], is_mute=True, key=key)
     assert (said.answers, said.signs, said.version, said.parameters) == (False, bool(key), None, {})
 
 
-def test_mavlink_1_and_damaged_bytes_are_seen(address):
+def test_request_link_counts_mavlink_1_and_damaged_bytes(address):
     said, _ = read(address, messages=healthy_messages(), version_1=True, noise=bytes(50))
     assert said.sends_mavlink1
     assert said.bad_bytes >= 50
 
 
-def test_a_second_autopilot_is_named_and_not_listened_to(address):
+def test_request_link_lists_a_second_autopilot_but_ignores_it(address):
     with AnsweringAutopilot(address.number, system_id=3), AnsweringAutopilot(address.number, system_id=4) as other:
         with RequestLink(address, system_id=4) as link:
             assert link.wait_for_heartbeat(60).get_srcSystem() == 4
@@ -97,7 +97,7 @@ def test_a_second_autopilot_is_named_and_not_listened_to(address):
     assert {message.get_srcSystem() for message in other.heard} <= {4}
 
 
-def test_a_cable_that_is_pulled_is_a_sentence(tmp_path):
+def test_request_link_reports_a_pulled_cable_in_one_sentence(tmp_path):
     cable = SerialCable(tmp_path)
     cable.plug()
     link = RequestLink(LinkAddress("serial", str(tmp_path / "a"), 115_200))

@@ -46,7 +46,7 @@ def requests(autopilot):
     return autopilot.conversation.requests
 
 
-def test_a_request_for_the_time_is_answered_by_the_clock_that_stamps_the_messages(autopilot):
+def test_timesync_request_is_answered_by_the_clock_of_the_timestamps(autopilot):
     autopilot.clock.now_s = 1234.5
     (answer,) = replies(autopilot, mavlink.MAVLink_timesync_message(tc1=0, ts1=987_654_321_012))
     assert (answer.tc1, answer.ts1) == (1_234_500_000_000, 987_654_321_012)
@@ -55,13 +55,13 @@ def test_a_request_for_the_time_is_answered_by_the_clock_that_stamps_the_message
 
 @pytest.mark.parametrize("form", [command_long, command_int])
 @pytest.mark.parametrize("wish", list(UserCommand))
-def test_a_wish_that_can_be_fulfilled_is_accepted_and_handed_on(autopilot, requests, form, wish):
+def test_user_command_is_accepted_and_passed_on(autopilot, requests, form, wish):
     assert answered(autopilot, form(31010, wish)) == "ACCEPTED"
     assert requests.take() == (wish, "255/190")
     assert requests.take() is None
 
 
-def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
+def test_pause_acknowledged_stops_all_fixes(autopilot, requests):
     assert answered(autopilot, command_long(31010, 1)) == "ACCEPTED"
     held = autopilot.put_fix()
     assert (held.sent, held.why.code) == (False, ReasonCode.PAUSED)
@@ -70,18 +70,18 @@ def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
 
 
 @pytest.mark.parametrize("to", [(0, 0), (7, 0), (0, 197), (7, 1), (8, 197), (7, 191)])
-def test_what_is_not_addressed_to_exactly_this_companion_is_not_obeyed(autopilot, requests, to):
+def test_commands_to_another_address_are_ignored(autopilot, requests, to):
     commands = command_long(31010, 1, to=to), command_int(31010, 1, to=to), command_long(400, 1, to=to)
     assert replies(autopilot, *commands) == []
     assert requests.take() is None
 
 
-def test_nothing_is_answered_that_claims_to_come_from_us(autopilot):
+def test_requests_that_claim_our_own_address_get_no_answer(autopilot):
     messages = mavlink.MAVLink_timesync_message(tc1=0, ts1=1), command_long(512, 148)
     assert replies(autopilot, *messages, sender=US) == []
 
 
-def test_a_flood_of_requests_is_answered_in_part_and_does_not_push_out_what_we_say(autopilot, requests):
+def test_requests_in_a_flood_are_answered_in_part_and_do_not_displace_our_messages(autopilot, requests):
     flood = [mavlink.MAVLink_timesync_message(tc1=0, ts1=number) for number in range(3 * MAX_ANSWERS_PER_S)]
     autopilot.take_sent()
     autopilot.conversation.send(make_status_text(INFO, "ours"))
@@ -102,7 +102,7 @@ def react(message, sender=STATION):
     return requests.handle(message, US, 5.0), requests, requests.take()
 
 
-def test_whatever_a_command_holds_it_has_one_answer_that_can_be_sent():
+def test_command_with_any_content_gets_exactly_one_answer():
     packer = mavlink.MAVLink(None, *US)
     for command, p1, p2, sender in itertools.product((31010, 511, 512), ODD, ODD, (STATION, (1, 1), (255, 0))):
         (ack,), _, wished = react(command_long(command, p1, p2), sender)
@@ -136,7 +136,7 @@ def told(texts: Texts, from_s: float = 0.0) -> list[tuple[int, str]]:
     return said
 
 
-def test_one_text_in_five_seconds_is_sent(texts):
+def test_text_queue_sends_one_text_in_five_seconds(texts):
     for name in "abc":
         texts.put(INFO, name)
     assert told(texts) == [(5.0, "a"), (10.0, "b"), (15.0, "c")]
@@ -144,7 +144,7 @@ def test_one_text_in_five_seconds_is_sent(texts):
     assert texts.next(500.0).text == "edgevpr: late", "after a silence at once"
 
 
-def test_the_newest_text_of_a_topic_takes_the_place_of_one_that_waits(texts):
+def test_text_queue_replaces_a_waiting_text_of_the_same_topic(texts):
     texts.put(WARNING, "camera lost", "camera")
     texts.put(WARNING, "map left", "map")
     texts.put(WARNING, "camera frozen", "camera")
@@ -154,7 +154,7 @@ def test_the_newest_text_of_a_topic_takes_the_place_of_one_that_waits(texts):
     assert told(texts, 100.0) == [], "what comes and goes again before its turn is no change"
 
 
-def test_a_new_warning_ends_the_note_that_all_is_well(texts):
+def test_text_queue_drops_a_note_of_recovery_after_a_new_warning(texts):
     texts.put(WARNING, "camera lost", "camera")
     texts.put(INFO, "camera is back", "camera")
     texts.put(WARNING, "camera frozen", "camera")

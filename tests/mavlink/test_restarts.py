@@ -69,7 +69,7 @@ class Aircraft(Autopilot):
         (40.0, True, None),
     ],
 )
-def test_a_power_cycle_of_any_length_makes_a_new_autopilot(silent_s, says_boot_time, timesync_s, caplog):
+def test_power_cycle_of_any_length_is_a_new_autopilot(silent_s, says_boot_time, timesync_s, caplog):
     aircraft = Aircraft({"GPS2_TYPE": 0}, says_boot_time=says_boot_time, timesync_s=timesync_s)
     aircraft.live(20)
     assert "GPS_INPUT" not in aircraft.names()
@@ -88,7 +88,7 @@ def test_a_power_cycle_of_any_length_makes_a_new_autopilot(silent_s, says_boot_t
     assert caplog.text.count("the autopilot has restarted") == 1
 
 
-def test_what_stays_the_same_is_said_and_asked_for_again():
+def test_power_cycle_repeats_announcements_and_requests():
     aircraft = Aircraft(VISION)
     aircraft.live(20)
     assert aircraft.names().count("SET_GPS_GLOBAL_ORIGIN") == 1
@@ -106,7 +106,7 @@ def test_what_stays_the_same_is_said_and_asked_for_again():
 
 
 @pytest.mark.parametrize("outage_s", [2.0, 8.0, 25.0])
-def test_an_outage_without_a_restart_resets_nothing(outage_s):
+def test_outage_without_a_restart_resets_nothing(outage_s):
     aircraft = Aircraft(VISION)
     aircraft.live(20)
     before = aircraft.conversation.autopilot.clock
@@ -120,7 +120,7 @@ def test_an_outage_without_a_restart_resets_nothing(outage_s):
     assert not any("restarted" in text for text in texts)
 
 
-def test_a_restart_is_recognised_though_the_new_boot_is_older_than_the_first_one_was():
+def test_restart_is_recognised_even_if_the_new_boot_time_is_higher():
     aircraft = Aircraft(VISION, booted_s=997.0)
     aircraft.live(3)
     aircraft.wait(9.0)
@@ -128,7 +128,7 @@ def test_a_restart_is_recognised_though_the_new_boot_is_older_than_the_first_one
     assert "edgevpr: autopilot has restarted" in aircraft.live(20)
 
 
-def test_messages_that_were_held_up_on_their_way_are_no_restart():
+def test_delayed_messages_are_not_a_restart():
     """A busy companion reads what has come in ten seconds at once."""
     aircraft = Aircraft(VISION)
     aircraft.live(20)

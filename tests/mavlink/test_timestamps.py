@@ -24,7 +24,7 @@ def stamps_at(path, utc_s: float = 0.0, clock=None) -> TimeStamps:
     return TimeStamps(path, clock or FakeClock(), lambda: utc_s)
 
 
-def test_it_is_kept_every_half_minute_and_the_next_start_is_a_minute_beyond_all_that_was_used(path):
+def test_time_stamps_are_saved_every_half_minute_and_resume_a_minute_later(path):
     clock = FakeClock()
     stamps = stamps_at(path, clock=clock)
     for _ in range(200):
@@ -36,7 +36,7 @@ def test_it_is_kept_every_half_minute_and_the_next_start_is_a_minute_beyond_all_
     assert after.check(STREAM, last) == OLD, "a message of before was admitted after the restart"
 
 
-def test_a_clock_that_is_set_forward_is_followed_and_one_that_is_set_back_is_not(path):
+def test_time_stamps_follow_a_clock_set_forward_but_not_one_set_back(path):
     utc_s = [1.8e9]
     stamps = TimeStamps(path, FakeClock(), lambda: utc_s[0])
     first = stamps.next()
@@ -60,7 +60,7 @@ while True:
 
 
 @pytest.mark.process
-def test_it_never_goes_back_over_kill_9(path):
+def test_time_stamps_never_decrease_after_kill_9(path):
     last = 0
     for lines in (1, 5000, 20_000):
         with subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True) as process:
@@ -75,7 +75,7 @@ def test_it_never_goes_back_over_kill_9(path):
 
 
 @pytest.mark.parametrize("content", [b"", b"soon\n", b"-5\n", b"9" * 20, b"\xff\x00", b"1" * 100, "²".encode()])
-def test_a_file_that_holds_no_time_or_cannot_be_written_is_refused_with_a_sentence(path, content):
+def test_time_stamps_refuse_an_invalid_or_unwritable_file_in_one_sentence(path, content):
     path.write_bytes(content)
     with pytest.raises(ConfigError, match="time"):
         stamps_at(path)
@@ -84,7 +84,7 @@ def test_a_file_that_holds_no_time_or_cannot_be_written_is_refused_with_a_senten
         stamps_at(path.parent / "no-folder" / "time")
 
 
-def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, caplog):
+def test_time_stamps_continue_on_a_full_disk(path, monkeypatch, caplog):
     clock = FakeClock()
     stamps = stamps_at(path, clock=clock)
 
@@ -102,7 +102,7 @@ def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, capl
     stamps_at(path)  # nor does it at the next start, where there is a time from before
 
 
-def test_a_borrowed_time_goes_on_from_the_file_and_leaves_it_as_it_is(path):
+def test_time_stamps_borrowed_from_a_file_leave_it_unchanged(path):
     clock = FakeClock()
     flown = stamps_at(path, clock=clock).next()
     before = path.read_bytes()

@@ -18,7 +18,7 @@ FAILED = mavlink.MAV_RESULT_FAILED
 FIX_2D = mavlink.GPS_FIX_TYPE_2D_FIX
 
 
-def test_its_position_is_known_while_it_is_fresh(autopilot):
+def test_position_is_known_while_it_is_fresh(autopilot):
     assert autopilot.vehicle is None
     vehicle = autopilot.position(50.1234567, -14.5, vx=-300, vy=1250)
     assert vehicle == Vehicle(
@@ -37,7 +37,7 @@ def test_its_position_is_known_while_it_is_fresh(autopilot):
     assert autopilot.position(vx=32_767, vy=32_767).velocity_m_s is None, "no small aircraft has it"
 
 
-def test_at_the_time_of_a_frame_it_is_where_its_velocity_takes_it(autopilot):
+def test_position_at_a_frame_time_is_extrapolated_with_the_velocity(autopilot):
     now_s = autopilot.position(vx=2000, vy=-1000).t_received_s
     for seconds in (-0.4, 0.25):
         there = autopilot.at(now_s + seconds)
@@ -48,20 +48,20 @@ def test_at_the_time_of_a_frame_it_is_where_its_velocity_takes_it(autopilot):
 
 
 @pytest.mark.parametrize("sender", [{"system_id": 9}, {"component_id": 190}])
-def test_nobody_else_says_where_we_are(autopilot, sender):
+def test_position_of_other_senders_is_ignored(autopilot, sender):
     assert autopilot.position(1.0, 1.0, **sender) is None
     autopilot.position(3.0, 3.0)
     assert autopilot.position(4.0, 4.0, **sender).lat_deg == 3.0
 
 
 @pytest.mark.parametrize("nowhere", [(0.0, 0.0), (91.0, 8.0), (50.0, 181.0)])
-def test_a_position_lost_is_not_remembered(autopilot, nowhere):
+def test_position_lost_is_not_kept(autopilot, nowhere):
     assert autopilot.position()
     assert autopilot.position(*nowhere) is None
 
 
 @pytest.mark.parametrize("message", [mavlink.MAVLink_gps_raw_int_message, mavlink.MAVLink_gps2_raw_message])
-def test_a_position_says_whether_gps_stands_behind_it(autopilot, message):
+def test_position_reports_whether_gps_supports_it(autopilot, message):
     autopilot.gps(FIX_2D, message=message)
     assert not autopilot.position().has_gps
     autopilot.gps(message=message)
@@ -76,7 +76,7 @@ def test_a_position_says_whether_gps_stands_behind_it(autopilot, message):
     assert not autopilot.position(50.00121).has_gps, "its receiver has fallen silent"
 
 
-def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
+def test_position_is_requested_until_it_arrives(autopilot):
     assert autopilot.questions() == [], "nobody wants to know"
     autopilot.conversation.request_position()
     version, *requests = autopilot.questions()
@@ -97,7 +97,7 @@ def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
     assert {int(each.param1) for each in asked} == set(intervals_us), "it says no attitude any more: it started anew"
 
 
-def test_it_is_asked_again_where_a_ground_station_has_set_other_rates(autopilot):
+def test_position_is_requested_again_after_a_change_of_rates(autopilot):
     autopilot.conversation.request_position()
     autopilot.questions()
     for attitude_hz, has_to_ask in ((10, False), (4, True), (10, False), (5, False)):
@@ -106,7 +106,7 @@ def test_it_is_asked_again_where_a_ground_station_has_set_other_rates(autopilot)
         assert (mavlink.MAVLINK_MSG_ID_ATTITUDE in asked) is has_to_ask, attitude_hz
 
 
-def test_the_attitude_is_that_of_the_frame_s_time(autopilot):
+def test_attitude_is_that_of_the_frame_time(autopilot):
     start_s = autopilot.clock.now_s
     for attitude in ((-10, 4, 350), (10, 8, 10), (20, 0, 20)):
         autopilot.attitude(*attitude)
@@ -123,7 +123,7 @@ def test_the_attitude_is_that_of_the_frame_s_time(autopilot):
     assert autopilot.vehicle.roll_deg is None
 
 
-def test_the_best_height_is_taken(autopilot):
+def test_height_uses_the_best_source(autopilot):
     assert autopilot.position().height_m == 80.0, "over the take-off point"
     autopilot.terrain(65.0)
     assert autopilot.position().height_m == 65.0
@@ -144,14 +144,14 @@ def test_the_best_height_is_taken(autopilot):
 @pytest.mark.parametrize(
     "wrong", [{"distance_m": 0.1}, {"distance_m": 120.0}, {"orientation": 0}, {"signal_quality": 1}]
 )
-def test_a_range_that_says_nothing_is_not_taken(autopilot, wrong):
+def test_height_ignores_an_invalid_range(autopilot, wrong):
     autopilot.range(**{"distance_m": 60.0} | wrong)
     assert autopilot.position().height_m == 80.0
 
 
 @pytest.mark.parametrize("message", [mavlink.MAVLink_gps_raw_int_message, mavlink.MAVLink_gps2_raw_message])
 @pytest.mark.parametrize(("h_acc", "sd_m"), [(1800, 1.8), (0, DEFAULT_GPS_SD_M), (2**32 - 1, DEFAULT_GPS_SD_M)])
-def test_the_certainty_is_with_gps_that_of_the_receiver(autopilot, message, h_acc, sd_m):
+def test_position_sd_with_gps_is_that_of_the_receiver(autopilot, message, h_acc, sd_m):
     autopilot.filter(ABS | REL)
     assert autopilot.sd_m() is None, "never known"
     autopilot.gps(h_acc=9000)
@@ -160,7 +160,7 @@ def test_the_certainty_is_with_gps_that_of_the_receiver(autopilot, message, h_ac
 
 
 @pytest.mark.parametrize("flags", [0, CONST_POS, ABS | REL | CONST_POS, mavlink.EKF_ATTITUDE])
-def test_a_filter_that_says_it_has_no_position_ends_the_certainty(autopilot, flags):
+def test_position_sd_is_unknown_once_the_filter_has_no_position(autopilot, flags):
     autopilot.gps()
     autopilot.sd_m()
     autopilot.gps(fix_type=1)
@@ -172,7 +172,7 @@ def test_a_filter_that_says_it_has_no_position_ends_the_certainty(autopilot, fla
     assert autopilot.sd_m() == DEFAULT_GPS_SD_M
 
 
-def test_a_fix_that_it_took_is_where_it_reckons_from(autopilot):
+def test_position_sd_grows_from_an_accepted_fix(autopilot):
     autopilot.gps()
     autopilot.sd_m()
     autopilot.gps(fix_type=1)
@@ -185,7 +185,7 @@ def test_a_fix_that_it_took_is_where_it_reckons_from(autopilot):
     assert autopilot.sd_m() == pytest.approx(math.hypot(12.0, DRIFT_M_S * 4))
 
 
-def test_a_filter_that_says_how_good_it_is_is_believed_while_it_speaks(autopilot):
+def test_position_sd_is_that_of_the_filter_while_it_is_reported(autopilot):
     autopilot.gps(h_acc=3000)
     autopilot.sd_m()
     autopilot.gps(fix_type=1)
@@ -200,7 +200,7 @@ def test_a_filter_that_says_how_good_it_is_is_believed_while_it_speaks(autopilot
     assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 15)), "it says no accuracy, and reckons"
 
 
-def test_another_autopilot_is_not_known_as_well_and_starts_with_a_clean_slate(autopilot):
+def test_vehicle_is_reset_for_another_autopilot(autopilot):
     autopilot.gps()
     assert autopilot.sd_m() == DEFAULT_GPS_SD_M
     for _ in range(5):

@@ -29,7 +29,7 @@ def test_models_fit_the_wheel():
     assert sum(path.stat().st_size for path in MODELS.rglob("*") if path.is_file()) < 4_200_000
 
 
-def test_matchability_keeps_a_picture_and_leaves_it_out_in_the_dark_in_fog_and_where_there_is_nothing():
+def test_matchability_keeps_an_image_but_not_darkness_fog_or_blank_images():
     card = load_card("matchability")
     assert "matchability.py" in card.source
     assert card.file_path.stat().st_size < 1_000_000

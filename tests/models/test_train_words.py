@@ -34,7 +34,7 @@ def train(folder, out, *more):
 
 
 @pytest.mark.parametrize(("kind", "technique"), [("vlad", "netvlad"), ("regions", "region_vlad")])
-def test_train_words_makes_the_technique_work(kind, technique, folder, own_models, capsys):
+def test_train_words_makes_the_technique_usable(kind, technique, folder, own_models, capsys):
     (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
     train(folder, own_models, "--kind", kind, "--count", "8")
     said = capsys.readouterr()

@@ -11,7 +11,7 @@ def track(east_m):
     return np.zeros(len(lon_deg)), lon_deg
 
 
-def test_gaps_stay_even_however_densely_a_stretch_was_mapped():
+def test_choose_places_keeps_gaps_even_despite_densely_mapped_stretches():
     crowded = np.concatenate((np.arange(0, 100, 10), 100 + np.arange(0, 10, 0.1), np.arange(120, 220, 10)))
     lat, lon = track(crowded)
     kept = choose_places(lat, lon, np.ones(len(crowded)), 22)
@@ -21,7 +21,7 @@ def test_gaps_stay_even_however_densely_a_stretch_was_mapped():
     assert gaps.min() > 4
 
 
-def test_of_two_places_side_by_side_the_one_that_says_more_stays():
+def test_choose_places_keeps_the_better_of_two_adjacent_places():
     lat, lon = track([0, 50, 51, 100])
     assert 1 in choose_places(lat, lon, np.array([1, 0.9, 0.2, 1]), 3)
     assert 2 in choose_places(lat, lon, np.array([1, 0.2, 0.9, 1]), 3)

@@ -34,12 +34,12 @@ def map_path(valley, tmp_path):
 
 @pytest.mark.parametrize("name", ["", "a\0b.gpkg", "\ud800.gpkg", "/"])
 @pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_writing, lambda path: PlaceMap.create(path, SPEC)])
-def test_place_map_refuses_a_name_that_no_file_can_have(use, name):
+def test_place_map_refuses_an_invalid_file_name(use, name):
     with pytest.raises(UsageError):
         use(name)
 
 
-def test_place_map_takes_a_name_that_is_not_utf_8(tmp_path):
+def test_place_map_accepts_a_name_that_is_not_utf_8(tmp_path):
     path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.gpkg")
     PlaceMap.create(path, SPEC).close()
     with PlaceMap.open(path) as place_map:
@@ -91,7 +91,7 @@ for _key, _value in WRONG_VALUES:
 
 
 @pytest.mark.parametrize(("change", "says"), TAMPERED.items(), ids=range(len(TAMPERED)))
-def test_place_map_refuses_a_map_that_was_tampered_with_in_a_sentence(map_path, change, says):
+def test_place_map_refuses_a_manipulated_map_in_one_sentence(map_path, change, says):
     write_sql(map_path, change)
     for use in (PlaceMap.open, PlaceMap.open_for_writing):
         with pytest.raises(MapError, match=says) as caught:
@@ -99,7 +99,7 @@ def test_place_map_refuses_a_map_that_was_tampered_with_in_a_sentence(map_path, 
         assert len(str(caught.value)) < 1500
 
 
-def test_describe_map_says_what_it_can(map_path):
+def test_describe_map_reports_what_is_readable(map_path):
     write_sql(
         map_path,
         "UPDATE gpkg_contents SET min_x = NULL, max_y = 'north'",
@@ -144,7 +144,7 @@ def test_check_places_misses_only_the_places_on_a_damaged_page(map_path):
     assert sorted(lost)[len(lost) * 9 // 10] <= 8
 
 
-def test_place_map_leaves_out_a_place_with_a_large_value(map_path):
+def test_place_map_skips_a_place_with_too_large_a_value(map_path):
     if sys.version_info < (3, 11):
         pytest.skip("this Python cannot ask SQLite for it")
     write_sql(map_path, "UPDATE places SET source_image = CAST(zeroblob(300000) AS TEXT) WHERE place_id = 3")

@@ -43,7 +43,7 @@ def ruler(ruler_map):
     return technique, place_map, load_index(place_map, technique, 10_000)
 
 
-def test_the_index_is_contiguous_and_of_the_size_promised(ruler):
+def test_index_is_contiguous_and_has_the_promised_size(ruler):
     technique, _, index = ruler
     assert len(index) == 25
     assert index.nbytes == 25 * compute_place_bytes(technique.spec)
@@ -51,7 +51,7 @@ def test_the_index_is_contiguous_and_of_the_size_promised(ruler):
     assert index.spacing_m() == pytest.approx(44.5, abs=0.1)
 
 
-def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ruler_map, caplog):
+def test_load_index_beyond_the_budget_keeps_the_best_places_in_ram_and_all_on_disk(ruler_map, caplog):
     technique, place_map = ruler_map
     each = compute_place_bytes(technique.spec)
     index = load_index(place_map, technique, 25 * each)
@@ -67,7 +67,7 @@ def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ru
     assert found[0].place.place_id in index.place_ids
 
 
-def test_a_budget_that_holds_no_place_and_an_empty_map_are_refused(ruler_map, tmp_path):
+def test_load_index_refuses_an_empty_map_and_a_budget_below_one_place(ruler_map, tmp_path):
     technique, place_map = ruler_map
     with pytest.raises(MapError, match="budget"):
         load_index(place_map, technique, compute_place_bytes(technique.spec) - 1)
@@ -75,7 +75,7 @@ def test_a_budget_that_holds_no_place_and_an_empty_map_are_refused(ruler_map, tm
         load_index(place_map, Ruler(), 10_000)
 
 
-def test_all_places_are_compared_unless_candidates_are_limited(ruler):
+def test_retrieve_compares_all_places_without_a_limit_of_candidates(ruler):
     technique, place_map, index = ruler
     query = technique.encode(43)
     everything = rank(technique, query, place_map, index)
@@ -120,7 +120,7 @@ def test_places_out_of_reach_are_no_candidates(ruler):
     assert load_candidates(ranking, index, place_map, 1)[0].place.source_image == "44"
 
 
-def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler):
+def test_retrieve_finds_rivals_in_the_whole_map_for_a_single_place_in_reach(ruler):
     technique, place_map, index = ruler
     query = technique.encode(20)
     alone = rank(technique, query, place_map, index, 20, 40.0, within(index, 80))
@@ -133,7 +133,7 @@ def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler):
     assert margin(right, index, 40.0) == pytest.approx(1 - 1 / 5)
 
 
-def test_the_index_knows_distances_and_headings(tmp_path):
+def test_index_keeps_headings_and_finds_places_within_a_distance(tmp_path):
     technique = Ruler()
     headings = (0.0, 359.99, 123.4, None, -90.0, 720.5)
     with PlaceMap.create(tmp_path / "turned.gpkg", technique.spec) as place_map:
@@ -164,7 +164,7 @@ class Turned(Ruler):
         return found if hypotheses is None or 2 in hypotheses else FineMatch(0.0)
 
 
-def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_compared(ruler):
+def test_match_gets_the_chosen_hypotheses_or_all_of_them(ruler):
     _, place_map, index = ruler
     technique = Turned()
     query = technique.encode(43)
@@ -189,7 +189,7 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     ],
     ids=["a large map", "a small map", "known headings", "few in reach"],
 )
-def test_in_a_large_map_more_are_compared_where_no_heading_is_known(ruler_map, monkeypatch, large, known, compared):
+def test_retrieve_compares_more_places_of_a_large_map_without_a_heading(ruler_map, monkeypatch, large, known, compared):
     class Tall(Turned):
         spec = dataclasses.replace(Ruler.spec, height_ratios=(1.0,))
 
@@ -203,12 +203,12 @@ def test_in_a_large_map_more_are_compared_where_no_heading_is_known(ruler_map, m
     assert sum(len(hypotheses) for hypotheses in technique.tried) == compared
 
 
-def test_more_are_compared_from_two_thousand_places_on():
+def test_retrieve_compares_more_places_from_two_thousand_on():
     assert [compute_candidate_factor(True, places) for places in (1999, 2000)] == [1, 1.6]
     assert compute_candidate_factor(False, 2000) == 1
 
 
-def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
+def test_ranking_counts_the_rotations_not_ruled_out(ruler_map):
     _, place_map = ruler_map
 
     class Known(Turned):
@@ -245,7 +245,7 @@ class Hasty(Ruler):
         return 1 / (1 + abs(float(fine[0]) + 5 - float(query.fine[0]))), hypotheses
 
 
-def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_full(ruler):
+def test_retrieve_matches_the_candidates_with_the_best_quick_scores(ruler):
     _, place_map, index = ruler
     technique = Hasty()
     ranking = rank(technique, technique.encode(41), place_map, index, 8, 5.0)
@@ -260,7 +260,7 @@ def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_ful
     assert (np.diff(ranking.scores) <= 0).all()
 
 
-def test_a_rival_is_one_that_looked_best_elsewhere(ruler):
+def test_retrieve_compares_a_rival_with_the_best_quick_score_elsewhere(ruler):
     _, place_map, index = ruler
     technique = Hasty()
     # All three that are compared are neighbours, within 150 m of 40: so five rivals are compared as well.
@@ -276,7 +276,7 @@ def test_a_rival_is_one_that_looked_best_elsewhere(ruler):
 
 
 @pytest.mark.parametrize("candidates", [3, None])
-def test_where_the_scan_counts_it_is_part_of_the_score(ruler, candidates):
+def test_retrieve_includes_the_scan_score_if_the_scan_counts(ruler, candidates):
     technique, place_map, index = ruler
     query = technique.encode(43)
     plain = rank(technique, query, place_map, index, candidates)
@@ -294,7 +294,7 @@ def test_where_the_scan_counts_it_is_part_of_the_score(ruler, candidates):
 @pytest.mark.parametrize(
     ("usual", "candidates", "glanced", "compared"), [(20, 25, 0, 25), (25, 25, 25, 3), (20, 24, 24, 3), (20, 3, 0, 3)]
 )
-def test_nothing_is_chosen_at_a_glance_where_all_or_few_are_compared(ruler, usual, candidates, glanced, compared):
+def test_retrieve_skips_quick_scores_if_few_places_are_compared(ruler, usual, candidates, glanced, compared):
     _, place_map, index = ruler
     technique = Hasty()
     technique.candidates = usual
@@ -302,7 +302,7 @@ def test_nothing_is_chosen_at_a_glance_where_all_or_few_are_compared(ruler, usua
     assert (len(technique.glanced), technique.compared) == (glanced, compared)
 
 
-def test_out_of_reach_five_are_compared_however_few_in_full(ruler):
+def test_retrieve_compares_five_places_out_of_reach_with_few_candidates(ruler):
     _, place_map, index = ruler
     technique = Hasty()
     rank(technique, technique.encode(41), place_map, index, 8, in_reach=within(index, *range(0, 60, 4)))
@@ -313,7 +313,7 @@ def test_out_of_reach_five_are_compared_however_few_in_full(ruler):
     ("candidates", "apart_m", "reach", "compared"),
     [(3, 60.0, None, 3 + 5), (2, 40.0, None, 2), (3, 40.0, None, 3), (3, 60.0, (80,), 1 + 5 + 2)],
 )
-def test_rivals_are_compared_where_no_candidate_is_one(ruler, candidates, apart_m, reach, compared):
+def test_retrieve_compares_rivals_if_no_candidate_is_one(ruler, candidates, apart_m, reach, compared):
     technique, place_map, index = ruler
     in_reach = reach and within(index, *reach)
     ranking = rank(technique, technique.encode(41), place_map, index, candidates, apart_m, in_reach)
@@ -325,7 +325,7 @@ class Unmoved(Ruler):
         return FineMatch(float(fine[0]))
 
 
-def test_a_few_places_all_over_the_map_are_asked_unmoved(ruler):
+def test_match_unmoved_places_compares_a_few_places_across_the_map(ruler):
     _, place_map, index = ruler
     technique = Unmoved()
     query = Query(technique=technique, descriptor=technique.encode(0), place_map=place_map, index=index)

@@ -26,7 +26,7 @@ def layers(path, shown):
 CUT = [(150.0, True), (100.0, True), (102.0, True), (150.0, True), (300.0, False)]
 
 
-def test_a_map_has_a_layer_for_each_footprint_that_it_was_cut_at(tmp_path):
+def test_layers_are_one_per_footprint_of_the_map(tmp_path):
     assert layers(tmp_path / "a.gpkg", CUT).footprints_m == (100.0, 150.0)
     assert layers(tmp_path / "b.gpkg", CUT[1:3]).footprints_m == (101.0,), "as good as one"
     assert layers(tmp_path / "c.gpkg", [(80.0, False), (160.0, False), (90.0, False)]).footprints_m == (90.0,)
@@ -34,11 +34,11 @@ def test_a_map_has_a_layer_for_each_footprint_that_it_was_cut_at(tmp_path):
 
 
 @pytest.mark.parametrize(("seen_m", "among_m"), [(60, 100), (125, 100), (150, 150), (400, 150), (None, None)])
-def test_a_picture_is_looked_for_among_places_that_show_a_little_less(tmp_path, seen_m, among_m):
+def test_choose_footprint_prefers_slightly_smaller_places(tmp_path, seen_m, among_m):
     assert layers(tmp_path / "m.gpkg", CUT).choose_footprint(seen_m) == among_m
 
 
-def test_a_search_leaves_out_what_was_cut_otherwise(tmp_path):
+def test_narrow_search_excludes_places_of_other_footprints(tmp_path):
     found = layers(tmp_path / "m.gpkg", CUT)
     whole = index_of([1, 2, 3, 4, 5, 9])  # 9 was learnt since
     assert found.narrow_search(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
@@ -49,6 +49,6 @@ def test_a_search_leaves_out_what_was_cut_otherwise(tmp_path):
     assert found.narrow_search(Expectation(), index_of([2, 3]), 150.0).in_reach is None, "none of them is in reach"
 
 
-def test_a_map_of_one_layer_is_searched_whole(tmp_path):
+def test_narrow_search_keeps_all_places_of_a_single_layer(tmp_path):
     expected = Expectation()
     assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow_search(expected, index_of([1, 2]), 300.0) is expected

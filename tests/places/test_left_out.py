@@ -77,7 +77,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("change", DAMAGE)
-def test_the_query_that_meets_a_damaged_place_is_refused_and_the_next_goes_without_it(ruler, change):
+def test_retrieve_refuses_the_first_query_at_a_damaged_place_and_then_excludes_it(ruler, change):
     technique, place_map, index = ruler
     damage(place_map, change, 100)
     query = technique.encode(142)
@@ -92,7 +92,7 @@ def test_the_query_that_meets_a_damaged_place_is_refused_and_the_next_goes_witho
     assert judge(Findings(ranking), index, RULE).accepted
 
 
-def test_without_the_right_place_no_other_is_accepted(ruler):
+def test_judge_accepts_no_other_place_while_the_correct_one_is_unreadable(ruler):
     """The query shows place 100, with a neighbour 111 m on that looks nearly like it: alone, the neighbour is ahead."""
     technique, place_map, index = ruler
     query, rule = technique.encode(104), dataclasses.replace(RULE, min_margin=0.01)
@@ -117,7 +117,7 @@ def test_without_the_right_place_no_other_is_accepted(ruler):
         (138, 60, False),
     ],
 )
-def test_a_place_left_out_may_be_right_if_its_row_is_as_like_as_the_best_or_among_three(
+def test_place_left_out_may_be_correct_if_its_row_is_as_similar_as_the_best_or_in_the_top_three(
     ruler, shown, number, may_be_right
 ):
     technique, place_map, index = ruler
@@ -127,7 +127,7 @@ def test_a_place_left_out_may_be_right_if_its_row_is_as_like_as_the_best_or_amon
     assert (number // 10 in ranking.unread) is may_be_right
 
 
-def test_where_most_cannot_be_read_the_file_is_at_fault_and_all_come_back_with_it(ruler):
+def test_retrieve_blames_the_file_if_most_places_are_unreadable_and_restores_all_with_it(ruler):
     technique, place_map, index = ruler
     fine = place_map.db.execute("SELECT fine, place_id FROM places").fetchall()
     place_map.db.execute("UPDATE places SET fine = x'00'")
@@ -144,7 +144,7 @@ def test_where_most_cannot_be_read_the_file_is_at_fault_and_all_come_back_with_i
     ("damaged", "candidates", "error"),
     [((140, 130), 3, PlaceError), ((140, 130, 150), 5, MapError), ((140, 130, 150), 6, PlaceError)],
 )
-def test_the_file_is_at_fault_where_three_and_most_cannot_be_read(ruler, damaged, candidates, error):
+def test_retrieve_blames_the_file_if_three_and_most_places_are_unreadable(ruler, damaged, candidates, error):
     technique, place_map, index = ruler
     damage(place_map, "fine = x'00'", *damaged)
     with pytest.raises(MapError) as caught:
@@ -154,7 +154,7 @@ def test_the_file_is_at_fault_where_three_and_most_cannot_be_read(ruler, damaged
     assert len(place_map.left_out) == (len(damaged) if error is PlaceError else 0)
 
 
-def test_rivals_elsewhere_are_found_among_the_places_that_can_be_read(ruler):
+def test_retrieve_finds_rivals_among_readable_places(ruler):
     technique, place_map, index = ruler
     place_map.left_out.update({16: "gone", 14: "gone"})
     ranking = rank(technique, technique.encode(142), place_map, index, candidates=1, apart_m=200.0)
@@ -162,7 +162,7 @@ def test_rivals_elsewhere_are_found_among_the_places_that_can_be_read(ruler):
     assert margin(ranking, index, 200.0) is not None
 
 
-def test_of_one_stage_a_place_left_out_is_still_a_rival_and_never_named(short):
+def test_single_stage_place_left_out_stays_a_rival_but_is_never_returned(short):
     technique, place_map, index = short
     damage(place_map, f"geom = x'{encode_point(1.0, 1.0).hex()}'", 140)
     ranking = rank(technique, technique.encode(142), place_map, index)

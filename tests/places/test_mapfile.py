@@ -31,7 +31,7 @@ def map_path(valley, tmp_path):
     return shutil.copy(valley, tmp_path / valley.name)
 
 
-def test_what_is_added_comes_back(map_path):
+def test_place_map_returns_what_was_added(map_path):
     with PlaceMap.open(map_path) as place_map:
         assert place_map.spec == SPEC
         places = list(place_map.read_places())
@@ -50,7 +50,7 @@ def test_what_is_added_comes_back(map_path):
     np.testing.assert_allclose(info.extent, (50.0001, 8.0, 50.0009, 8.0))
 
 
-def test_a_closed_map_is_one_file_that_a_read_only_card_can_hold(map_path):
+def test_closed_map_is_one_file_for_a_read_only_card(map_path):
     assert [entry.name for entry in map_path.parent.iterdir()] == [map_path.name]
     card = map_path.parent / "card"
     card.mkdir()
@@ -77,7 +77,7 @@ def test_gdal_reads_the_places(map_path):
     np.testing.assert_array_equal(np.frombuffer(columns["coarse"][4], "<f2"), descriptor(4).coarse)
 
 
-def test_sqlite_full_says_make_room(map_path):
+def test_add_asks_for_disk_space_if_sqlite_is_full(map_path):
     place_map = PlaceMap.open_for_writing(map_path)
     (pages,) = place_map.db.execute("PRAGMA page_count").fetchone()
     place_map.db.execute(f"PRAGMA max_page_count = {pages + 1}")
@@ -90,7 +90,7 @@ def test_sqlite_full_says_make_room(map_path):
         assert len(again) >= 11
 
 
-def test_another_technique_or_parameter_is_refused_by_name(map_path):
+def test_require_technique_refuses_another_technique_or_parameter_by_name(map_path):
     with PlaceMap.open(map_path) as place_map:
         with pytest.raises(MapError, match="seed"):
             place_map.require_technique(dataclasses.replace(SPEC, parameters={"seed": 2}))
@@ -103,21 +103,21 @@ def test_another_technique_or_parameter_is_refused_by_name(map_path):
         place_map.require_technique(SPEC)
 
 
-def test_a_map_from_before_the_release_is_read_and_one_of_another_format_refused(map_path):
+def test_open_reads_a_prerelease_map_and_refuses_another_format(map_path):
     for version, is_read in ((1, True), (4, True), (2, False), (5, False)):
         write_sql(map_path, f"UPDATE edgevpr_map SET value = '{version}' WHERE key = 'format_version'")
         with contextlib.nullcontext() if is_read else pytest.raises(MapError, match=f"format {version}"):
             PlaceMap.open(map_path).close()
 
 
-def test_an_existing_map_is_never_overwritten(map_path):
+def test_create_never_overwrites_an_existing_map(map_path):
     before = map_path.read_bytes()
     with pytest.raises(MapError, match="exists already"):
         PlaceMap.create(map_path, SPEC)
     assert map_path.read_bytes() == before
 
 
-def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path):
+def test_merge_maps_copies_new_places_and_refuses_other_techniques(map_path, tmp_path):
     with PlaceMap.create(tmp_path / "other.gpkg", SPEC) as other:
         for number in (8, 9, 10, 11):
             other.add(frame(number), descriptor(number))
@@ -134,7 +134,7 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
 
 
 @pytest.mark.parametrize("value", ["''", "'7'", "'null'", "'{'", f"'{'[' * 100_000}'", "x'ff'"], ids=range(6))
-def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
+def test_open_tolerates_damaged_metadata(map_path, value):
     with PlaceMap.open_for_writing(map_path) as place_map:
         assert (place_map.mask_sha256, place_map.calibration) == (None, None)
         place_map.record_mask("m")
@@ -147,7 +147,7 @@ def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
         assert len(list(place_map.read_places())) == 10
 
 
-def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_known_of_them(map_path, tmp_path):
+def test_repair_map_keeps_place_ids_and_metadata(map_path, tmp_path):
     with PlaceMap.open_for_writing(map_path) as place_map:
         place_map.record_mask("m")
         place_map.record_lens("/camera/lens.yaml")
@@ -184,7 +184,7 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
         ("source_image = CAST(x'ff41' AS TEXT)", "its source_image is not text"),
     ],
 )
-def test_what_another_program_has_spoilt_is_named(map_path, change, says):
+def test_open_names_what_another_program_has_damaged(map_path, change, says):
     write_sql(map_path, f"UPDATE places SET {change} WHERE place_id = 3")
     with PlaceMap.open(map_path) as place_map:
         assert [place_id for place_id, *_ in place_map.read_coarse_parts()] == [1, 2, *range(4, 11)]
@@ -195,13 +195,13 @@ def test_what_another_program_has_spoilt_is_named(map_path, change, says):
                 list(place_map.read_places())
 
 
-def test_a_time_of_another_form_is_no_time(map_path):
+def test_read_places_treats_a_time_in_another_format_as_unknown(map_path):
     write_sql(map_path, "UPDATE places SET time = '2016/06/23 10:00'")
     with PlaceMap.open(map_path) as place_map:
         assert {place.t_utc_s for place in place_map.read_places()} == {None}
 
 
-def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_picture_does(map_path):
+def test_has_descriptor_tolerates_last_bits_but_not_another_image(map_path):
     rng = np.random.default_rng(4)
     with PlaceMap.open(map_path) as place_map:
         ids = [place_id for found in place_map.select_ids("source_image").values() for place_id in found]
@@ -218,7 +218,7 @@ def unit(rng, shape):
     return values / np.linalg.norm(values)
 
 
-def test_a_place_of_bytes_is_known_again_where_a_few_of_them_differ(tmp_path):
+def test_has_descriptor_tolerates_a_few_different_bytes(tmp_path):
     spec = dataclasses.replace(SPEC, coarse=PartSpec((100,), "|u1"), packed=None)
     there = np.random.default_rng(1).integers(0, 256, 100, np.uint8)
     with PlaceMap.create(tmp_path / "bytes.gpkg", spec) as place_map:
@@ -229,7 +229,7 @@ def test_a_place_of_bytes_is_known_again_where_a_few_of_them_differ(tmp_path):
             assert place_map.has_descriptor(place_id, again) is same
 
 
-def test_one_map_of_several_names_the_owners_of_all(tmp_path):
+def test_merge_maps_keeps_all_attributions(tmp_path):
     paths = [tmp_path / f"{owner}.gpkg" for owner in ("Y", "None", "X")]
     for path in paths:
         with PlaceMap.create(path, SPEC) as place_map:
@@ -257,7 +257,7 @@ def identity(map_path):
         "UPDATE places SET place_id = 90 WHERE place_id = 10",
     ],
 )
-def test_read_identity_is_that_of_a_copy_until_anything_changes(map_path, tmp_path, change):
+def test_read_identity_is_equal_for_a_copy_until_a_change(map_path, tmp_path, change):
     before = identity(map_path)
     assert identity(shutil.copy(map_path, tmp_path / "copy.gpkg")) == before
     assert (before.places, len(before.map_id)) == (10, 32)
@@ -270,7 +270,7 @@ def test_read_identity_is_that_of_a_copy_until_anything_changes(map_path, tmp_pa
     ("courses_deg", "one_way_deg"),
     [([90.0] * 4, 90.0), ([90.0, 270.0] * 2, None), ([0.0, 90.0, 180.0, 270.0], None), ([80.0, 100.0] * 2, 90.0)],
 )
-def test_describe_map_tells_the_course_of_a_map_whose_lines_are_flown_one_way(tmp_path, courses_deg, one_way_deg):
+def test_describe_map_reports_the_course_of_a_map_flown_in_one_direction(tmp_path, courses_deg, one_way_deg):
     spec = dataclasses.replace(SPEC, parameters={"camera": "nadir"})
     with PlaceMap.create(tmp_path / "map.gpkg", spec) as place_map:
         for line, course_deg in enumerate(courses_deg):

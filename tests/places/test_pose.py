@@ -25,7 +25,7 @@ def posed(tmp_path):
     return path
 
 
-def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path):
+def test_pose_and_landmarks_are_stored_and_optional(posed, tmp_path):
     assert merge_maps([posed], tmp_path / "copy.gpkg") == ([(2, 0)], False)
     with PlaceMap.open(posed) as place_map, PlaceMap.open(tmp_path / "copy.gpkg") as copy:
         for each in (place_map, copy):
@@ -54,7 +54,7 @@ def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path)
         ("landmarks = zeroblob(20000)", "its landmarks have the wrong size"),
     ],
 )
-def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
+def test_pose_that_is_implausible_is_refused(posed, change, says):
     write_sql(posed, f"UPDATE places SET {change} WHERE place_id = 1")
     with PlaceMap.open(posed) as place_map:
         (broken,) = [each for each in check_places(place_map) if each.problem]
@@ -63,7 +63,7 @@ def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
             [*place_map.read_places([1]), place_map.read_landmarks(1)]
 
 
-def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(posed):
+def test_repair_map_drops_only_damaged_landmarks_of_a_place(posed):
     write_sql(posed, "UPDATE places SET landmarks = x'00' WHERE place_id = 1")
     found = check_map(posed)
     assert (found.places, found.total, len(found.damaged)) == (2, 2, 1)
@@ -74,7 +74,7 @@ def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(pos
         assert place_map.read_landmarks(1) is None
 
 
-def test_a_place_moved_by_another_program_keeps_its_pose_and_forgets_where_it_was_recorded(posed):
+def test_pose_is_kept_if_another_program_moves_the_place_but_not_its_recorded_position(posed):
     write_sql(posed, f"UPDATE places SET geom = x'{encode_point(51.0, 9.0).hex()}' WHERE place_id = 1")
     with PlaceMap.open(posed) as place_map:
         (place,) = place_map.read_places([1])

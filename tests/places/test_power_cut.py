@@ -36,7 +36,7 @@ def killed(tmp_path_factory):
 
 
 @pytest.mark.parametrize("rest", ["missing", "zeros"])
-def test_a_log_that_ends_anywhere_keeps_every_place_that_was_in_it_whole_and_takes_new_ones(killed, tmp_path, rest):
+def test_open_for_writing_recovers_complete_places_from_a_truncated_log(killed, tmp_path, rest):
     log = killed.with_name("killed.gpkg-wal").read_bytes()
     ends = {end + off for end in range(HEADER + FRAME, len(log), FRAME) for off in (-1, 0, 1)}
     kept = {}

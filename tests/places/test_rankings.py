@@ -16,7 +16,7 @@ def tried(by_hypothesis, count, among=None):
     return dict(choose_best(by_hypothesis.max(axis=1), by_hypothesis, among, count))
 
 
-def test_of_many_places_the_best_hypotheses_of_all_are_tried():
+def test_choose_hypotheses_takes_the_best_of_many_places():
     by_hypothesis = np.random.default_rng(1).random((500, 24), dtype=np.float32)
     found = tried(by_hypothesis, 60)
     assert sum(len(each) for each in found.values()) == 60
@@ -29,7 +29,7 @@ def test_of_many_places_the_best_hypotheses_of_all_are_tried():
 
 
 @pytest.mark.parametrize(("places", "most"), [(1, 24), (2, 24), (5, 12), (19, 3), (20, 3), (60, 3)])
-def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, most):
+def test_choose_hypotheses_takes_more_per_place_if_there_are_few_places(places, most):
     by_hypothesis = np.random.default_rng(3).random((places, 24), dtype=np.float32)
     by_hypothesis[0] += 1
     found = tried(by_hypothesis, 60)
@@ -37,7 +37,7 @@ def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, mo
     assert sum(len(each) for each in found.values()) == min(60, places * most)
 
 
-def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it():
+def test_choose_hypotheses_skips_excluded_ones_without_adding_places():
     by_hypothesis = np.random.default_rng(4).random((500, 24), dtype=np.float32)
     by_hypothesis[:, 3:] = -np.inf
     by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
@@ -48,7 +48,7 @@ def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it
     assert not tried(by_hypothesis, 10)
 
 
-def test_only_hypotheses_of_the_places_asked_for_are_tried():
+def test_choose_hypotheses_takes_only_those_of_the_requested_places():
     by_hypothesis = np.random.default_rng(5).random((500, 24), dtype=np.float32)
     among = np.zeros(500, bool)
     assert not tried(by_hypothesis, 10, among)
@@ -65,7 +65,7 @@ def ranking(compared, rest=(), unread=()):
     )
 
 
-def test_of_a_place_that_both_compared_the_better_match_counts():
+def test_merge_rankings_keeps_the_better_match_of_a_place_in_both():
     one = ranking({4: 0.3, 7: 0.1}, rest=[(2, 0.09), (5, 0.08)])
     other = ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3])
     both = merge_rankings(one, other)
@@ -75,7 +75,7 @@ def test_of_a_place_that_both_compared_the_better_match_counts():
     assert both.unread.tolist() == [3]
 
 
-def test_together_has_tried_the_rotations_of_both():
+def test_merge_rankings_adds_the_rotations_tried():
     known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
     assert merge_rankings(known, known).tried == 0.25
     assert merge_rankings(known, all_of_them).tried == 1.0
@@ -87,7 +87,7 @@ def test_promote_moves_a_place_to_the_front():
     np.testing.assert_allclose(promoted.scores, [0.1, 0.3, 0.2], rtol=1e-6)
 
 
-def test_elsewhere_is_beyond_the_two_beside_and_not_of_the_same_places():
+def test_outside_neighbourhood_excludes_two_neighbours_and_the_same_places():
     index, slots = index_of(range(10, 17)), np.arange(7)
     assert outside_neighbourhood(index, 3, slots, 50.0).tolist() == [True, False, False, False, False, False, True]
     assert outside_neighbourhood(index, 3, slots, 50.0, same_ids=(10,)).tolist() == [False] * 6 + [True]

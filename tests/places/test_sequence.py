@@ -59,7 +59,7 @@ def scores():
 
 
 @pytest.mark.parametrize("length", [2, 5, 10, 30])
-def test_the_search_is_that_of_the_paper(scores, length):
+def test_sequence_search_equals_the_paper(scores, length):
     sequence = SequenceSearch(length)
     online = np.stack([dense(each, 40) for each in followed(sequence, scores, index_of(range(40)))])
     np.testing.assert_allclose(online, literal(scores, length), rtol=1e-5)
@@ -67,7 +67,7 @@ def test_the_search_is_that_of_the_paper(scores, length):
     np.testing.assert_allclose(sequence.rivals, literal(scores, length, OTHERS)[-1], rtol=1e-5)
 
 
-def test_two_stages_leave_places_out_and_are_the_same_search(scores):
+def test_sequence_search_in_two_stages_equals_the_dense_search(scores):
     candidates = np.argsort(-scores, axis=1)[:, :6]
     compared = np.take_along_axis(scores, candidates, axis=1)
     sparse = np.repeat(np.median(compared, axis=1)[:, None], 40, axis=1)  # the usual score, where none was made
@@ -77,7 +77,7 @@ def test_two_stages_leave_places_out_and_are_the_same_search(scores):
     np.testing.assert_allclose(np.stack([dense(each, 40) for each in rankings]), literal(sparse, 4), rtol=1e-5)
 
 
-def test_a_flight_through_lookalikes_is_told_by_what_came_before():
+def test_sequence_search_resolves_look_alikes_by_earlier_queries():
     """Place 30 looks a little more like the query than place 12, where the aircraft is; the way there does not."""
     scores = np.full((6, 40), 0.3, np.float32)
     for at in range(6):
@@ -88,7 +88,7 @@ def test_a_flight_through_lookalikes_is_told_by_what_came_before():
     assert best == [7, 8, 9, 10, 11, 12]
 
 
-def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_sequence(scores):
+def test_sequence_matches_keep_the_shift_of_the_newest_query_and_score_the_sequence(scores):
     sequence, index = SequenceSearch(3), index_of(range(40))
     sequence.add_query(ranked(scores[0], range(20)), index, 0.0)
     ranking = sequence.add_query(ranked(scores[1], range(10, 30)), index, 1.0)
@@ -100,7 +100,7 @@ def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_seq
         assert match == FineMatch(scored[slot], shift_cells=(float(slot), 1.0), rotation_deg=30.0)
 
 
-def test_a_gap_in_time_begins_a_new_sequence(scores):
+def test_sequence_search_restarts_after_a_time_gap(scores):
     sequence, index = SequenceSearch(5), index_of(range(40))
     followed(sequence, scores[:5], index)
     assert sequence.frames == 5
@@ -112,7 +112,7 @@ def test_a_gap_in_time_begins_a_new_sequence(scores):
 
 
 @pytest.mark.slow
-def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
+def test_sequence_memory_stays_within_its_declared_size():
     places, length = 50_000, 10
     index = index_of(range(places))
     scores = np.random.default_rng(2).random(places, dtype=np.float32)
@@ -134,7 +134,7 @@ def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
         ([(5, 0.9), (60, 0.1), (20, 0.1)], 0.0, False),  # the newest was not compared with the place
     ],
 )
-def test_the_newest_query_must_still_see_the_place(queries, least, is_continued):
+def test_sequence_search_requires_the_newest_query_to_show_the_place(queries, least, is_continued):
     sequence, near = SequenceSearch(3), abs(np.arange(80) - 7) <= 2
     index = index_of(range(80))
     for query, (slot, score) in enumerate(queries):

@@ -31,7 +31,7 @@ def machine(tree, model=None, ram_kb=4_000_000, **limits):
 
 
 @pytest.mark.parametrize("name", list_boards())
-def test_load_board_gives_a_whole_profile_with_its_sources(name):
+def test_load_board_gives_a_complete_profile_with_its_sources(name):
     board = load_board(name)
     assert board.name == name
     assert board.source
@@ -90,21 +90,21 @@ def test_load_board_does_not_subtract_the_limits_of_the_service_twice(tree):
     assert load_board("this", machine(tree, model, memory_max=memory_max, cpu_max=quota)) == free
 
 
-def test_load_board_reads_where_this_machine_begins_to_slow_down(tree):
+def test_load_board_reads_the_throttling_temperature_of_this_machine(tree):
     assert load_board("this", machine(tree, "Raspberry Pi 3 Model B Plus Rev 1.3")).thermal_limit_c == 60
     zone = {"type": "CPU-therm\n", "trip_point_0_type": "passive\n", "trip_point_0_temp": "97000\n"}
     tree({f"sys/class/thermal/thermal_zone0/{name}": text for name, text in zone.items()})
     assert load_board("this", machine(tree, "NVIDIA Jetson Nano Developer Kit")).thermal_limit_c == 97
 
 
-def test_load_board_says_of_an_unknown_board_whose_figures_it_has(tree):
+def test_load_board_names_the_origin_of_the_figures_of_an_unknown_board(tree):
     board = load_board("this", machine(tree, "Radxa ROCK 5B", ram_kb=16_000_000))
     assert (board.name, board.idle_w, board.full_w, board.verified) == ("generic-x86", 0.0, 1.0, False)
     assert "Radxa ROCK 5B" in board.title
     assert (board.ram_mb, board.thermal_limit_c) == (16384.0, 80.0)
 
 
-def test_is_this_machine_by_the_text_of_a_profile_of_ones_own(tree, tmp_path):
+def test_is_this_machine_matches_the_text_of_a_custom_profile(tree, tmp_path):
     mine = load_board(changed_profile(tmp_path, recognised_by="ROCK 5"))
     assert mine.is_this_machine(machine(tree, "Radxa ROCK 5B"))
     assert not load_board("rpi-4b").is_this_machine(machine(tree, "Radxa ROCK 5B"))

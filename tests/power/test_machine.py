@@ -11,14 +11,14 @@ MEMINFO = "MemTotal:        2000000 kB\nMemFree:          100000 kB\n"
 SERVICE = "1:cpu:/\n0::/system.slice/edgevpr.service\n"
 
 
-def test_ram_limit_is_that_of_the_machine_without_control_groups(tree):
+def test_read_ram_limit_is_that_of_the_machine_without_control_groups(tree):
     root = tree({"proc/meminfo": MEMINFO})
     assert machine.read_ram_limit_mb(root) == machine.read_ram_mb(root) == 2048.0
     assert machine.count_usable_cores(root) == len(os.sched_getaffinity(0))
 
 
 @pytest.mark.parametrize(("above", "limit_mb"), [("max", 536.870912), ("100000000", 100.0)])
-def test_ram_limit_is_the_lowest_of_the_control_groups(tree, above, limit_mb):
+def test_read_ram_limit_is_the_lowest_of_the_control_groups(tree, above, limit_mb):
     slice_of_system = "sys/fs/cgroup/system.slice"
     limits = {f"{slice_of_system}/edgevpr.service/memory.max": "536870912\n", f"{slice_of_system}/memory.max": above}
     root = tree({"proc/meminfo": MEMINFO, "proc/self/cgroup": SERVICE} | limits)
@@ -41,7 +41,7 @@ def test_cores_obey_the_affinity_of_the_process(tree):
         os.sched_setaffinity(0, allowed)
 
 
-def test_rss_grows_by_what_the_process_touches():
+def test_rss_grows_with_the_memory_that_the_process_touches():
     before_mb = machine.read_rss_mb()
     with mmap.mmap(-1, 30_000_000) as held:  # pages of its own: other memory may come from what tests before have freed
         held.write(os.urandom(30_000_000))

@@ -61,7 +61,7 @@ class Working(FakeClock):
         self.load.add_work(StageCost(wall_s, ran_s))
 
 
-def test_own_load_counts_what_no_recorded_work_explains_too():
+def test_own_load_counts_unrecorded_work_too():
     clocks = Working()
     clocks.work(0.5, 0.5)
     clocks.now_s += 1.5
@@ -73,7 +73,7 @@ def test_own_load_counts_what_no_recorded_work_explains_too():
     assert clocks.load.measure() == (0.0, 0.0), "since the last look"
 
 
-def test_own_load_is_late_only_where_its_thread_was_kept_waiting():
+def test_own_load_is_late_only_if_its_thread_had_to_wait():
     clocks = Working()
     clocks.work(0.99, 0.97)
     clocks.now_s += 0.01

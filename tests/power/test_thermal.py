@@ -38,12 +38,12 @@ def state(temperature_c, frequency_mhz, throttled, why="", **more):
         ),
     ],
 )
-def test_look_reads_temperature_frequency_and_throttling(tree, files, expected):
+def test_thermal_watch_reads_temperature_frequency_and_throttling(tree, files, expected):
     assert ThermalWatch(tree(PI | files)).read() == expected
 
 
 @pytest.mark.parametrize("nonsense", ["hot\n", "999999999\n", "-300000\n", "\udcff"])
-def test_look_takes_nonsense_as_unknown(tree, nonsense):
+def test_thermal_watch_treats_invalid_values_as_unknown(tree, nonsense):
     root = tree(PI)
     (root / f"{ZONE}0/temp").write_bytes(nonsense.encode(errors="surrogateescape"))
     (root / f"{POLICY}/scaling_cur_freq").write_bytes(b"-1\n")
@@ -54,7 +54,7 @@ def test_look_takes_nonsense_as_unknown(tree, nonsense):
     assert watch.read() == state(None, None, False), "where sensors disappear too"
 
 
-def test_look_takes_a_sinking_frequency_limit_as_throttling(tree):
+def test_thermal_watch_treats_a_falling_frequency_limit_as_throttling(tree):
     root = tree(PI)
     watch = ThermalWatch(root)
     assert watch.read().throttled is False
@@ -76,12 +76,12 @@ def test_look_takes_a_sinking_frequency_limit_as_throttling(tree):
         ("what\n", False, "", None, False),
     ],
 )
-def test_look_reads_the_flags_of_the_firmware(tree, answer, throttled, why, under_voltage, hot):
+def test_thermal_watch_reads_the_flags_of_the_firmware(tree, answer, throttled, why, under_voltage, hot):
     expected = state(48.312, 600.0, throttled, why=why, under_voltage=under_voltage, hot=hot)
     assert ThermalWatch(tree(PI | {FIRMWARE: answer})).read() == expected
 
 
-def test_look_sees_an_under_voltage_between_two_readings_once(tree):
+def test_thermal_watch_reports_an_under_voltage_between_two_readings_once(tree):
     watch = ThermalWatch(tree(PI | {FIRMWARE: "0\n"}))
     seen = []
     for answer in ("0\n", "10000\n", "10000\n", "50000\n"):
@@ -91,7 +91,7 @@ def test_look_sees_an_under_voltage_between_two_readings_once(tree):
 
 
 @pytest.mark.parametrize("more", [{}, {FIRMWARE: "0\n"}])
-def test_look_takes_the_alarm_of_the_driver_as_under_voltage(tree, more):
+def test_thermal_watch_treats_the_alarm_of_the_driver_as_under_voltage(tree, more):
     other = {f"{HWMON}0/name": "cpu_thermal\n", f"{HWMON}0/in0_lcrit_alarm": "1\n"}
     alarm = f"{HWMON}1/in0_lcrit_alarm"
     watch = ThermalWatch(tree(PI | more | other | {f"{HWMON}1/name": "rpi_volt\n", alarm: "0\n"}))
@@ -103,7 +103,7 @@ def test_look_takes_the_alarm_of_the_driver_as_under_voltage(tree, more):
 
 
 @pytest.mark.parametrize(("hot_c", "hot"), [(None, False), (70.0, True), (76.0, False)])
-def test_look_is_hot_at_the_temperature_of_the_profile(tree, hot_c, hot):
+def test_thermal_watch_is_hot_at_the_temperature_of_the_profile(tree, hot_c, hot):
     assert ThermalWatch(tree(PI | {f"{ZONE}0/temp": "75000\n"}), hot_c).read().hot is hot
 
 
@@ -125,5 +125,5 @@ def trips(**points):
         ({}, 80.0),
     ],
 )
-def test_limit_c_is_the_first_point_where_the_kernel_slows_down(tree, points, expected_c):
+def test_thermal_limit_is_the_first_trip_point_of_the_kernel(tree, points, expected_c):
     assert read_limit_c(tree({f"{ZONE}0/type": "x86_pkg_temp\n"} | trips(**points))) == expected_c

@@ -14,7 +14,7 @@ from edgevpr.review.album import embed_pictures, make_album, make_map_album
 LENS = Lens(60.0)
 
 
-def test_align_picture_gives_the_picture_whose_top_points_where_the_pose_says(tmp_path):
+def test_align_picture_returns_the_image_in_the_orientation_of_the_pose(tmp_path):
     places = places_in(tmp_path)
     tags = {place.source_image: GeoTag(position=place.position, heading_deg=place.pose.up_deg) for place in places}
     write_positions(tmp_path / "positions.csv", tags)
@@ -38,7 +38,7 @@ def test_make_map_album_cuts_the_pictures_of_an_orthophoto_again(tmp_path):
     assert make_map_album([], places).find_image("town.tif_r000_c000") is None
 
 
-def test_embed_pictures_makes_them_smaller_and_then_fewer_until_they_fit(tmp_path):
+def test_embed_pictures_shrinks_images_and_then_drops_some(tmp_path):
     keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
     albums = {"seen": make_album([tmp_path])}
     sizes = []

@@ -14,7 +14,7 @@ def outcomes(flight):
     return [each.fix.outcome for each in flight.queries]
 
 
-def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
+def test_read_flight_assigns_a_later_answer_to_its_fix(tmp_path):
     lines = [("query", query(name)) for name in ("a", "b", "c", "d")]
     refused, superseded = ({"code": code, "parameters": {}} for code in ("WRONG_FORM", "SUPERSEDED"))
     answers = [
@@ -26,7 +26,7 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
     assert flight.queries[1].fix.why.code is ReasonCode.WRONG_FORM
 
 
-def test_a_file_that_is_missing_is_a_remark(tmp_path):
+def test_read_flight_remarks_on_a_missing_file(tmp_path):
     path = tmp_path / "flight.jsonl"
     with FlightLog(path, max_mb=0.02) as log:
         log.write("start", map="m.gpkg", t_mono_s=1000.0)
@@ -39,14 +39,14 @@ def test_a_file_that_is_missing_is_a_remark(tmp_path):
     assert 0 < len(flight.queries) < 4
 
 
-def test_a_log_without_a_first_line_is_a_flight(tmp_path):
+def test_read_flight_accepts_a_log_without_its_first_line(tmp_path):
     log = tmp_path / "log"
     log.write_text(json.dumps({"kind": "query", "t_mono_s": 5.0} | query("a")) + "\n")
     flight = read_flight(log)
     assert (flight.start, len(flight.queries)) == ({}, 1)
 
 
-def test_values_of_a_wrong_type_are_unknown(tmp_path):
+def test_read_flight_treats_values_of_a_wrong_type_as_unknown(tmp_path):
     wrong = {
         "located": {"lat_deg": 95.0, "lon_deg": 8.0},
         "position": [1, 2],

@@ -71,7 +71,7 @@ def test_map_page_is_never_written_over_the_map(mapped, capsys):
     assert (mapped / "valley.gpkg").read_bytes() == before
 
 
-def test_find_gaps_where_a_picture_is_missing_between_others(tmp_path):
+def test_find_gaps_finds_ground_missing_between_images(tmp_path):
     places = [
         replace(
             place, pose=replace(place.pose, up_deg=0.0), position=Position(*position(east * STEP_M, north * STEP_M))
@@ -89,7 +89,7 @@ def test_find_gaps_where_a_picture_is_missing_between_others(tmp_path):
     assert find_gaps([replace(place, pose=None) for place in places]) == ([], 0.0, 0.0)
 
 
-def test_measure_inconsistent_tags_names_those_far_from_their_pictures(tmp_path):
+def test_measure_inconsistent_tags_finds_tags_far_from_their_images(tmp_path):
     places = [
         replace(place, pose=replace(place.pose, recorded=Position(*position(0.1 * at, 400.0 if at == 4 else 0.0))))
         for at, place in enumerate(places_in(tmp_path))

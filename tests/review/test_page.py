@@ -50,7 +50,7 @@ def test_flight_page_shows_query_and_match_side_by_side_though_their_pictures_ha
     assert abs(seen.astype(int) - found).mean() > 20
 
 
-def test_make_album_finds_pictures_of_the_folders_that_are_given_only(tmp_path):
+def test_make_album_finds_only_images_in_the_given_folders(tmp_path):
     folder = tmp_path / "given"
     folder.mkdir()
     cv2.imwrite(str(tmp_path / "secret.png"), np.full((20, 20), 90, np.uint8))
@@ -62,7 +62,7 @@ def test_make_album_finds_pictures_of_the_folders_that_are_given_only(tmp_path):
         assert album.find_image(name) is None
 
 
-def test_flight_page_takes_names_in_the_log_as_text(tmp_path):
+def test_flight_page_treats_names_in_the_log_as_text(tmp_path):
     nasty = query(
         NASTY, reason={"code": "UNUSABLE", "parameters": {"problem": NASTY}}, reference_image=NASTY, accepted=False
     )
@@ -80,7 +80,7 @@ def test_flight_page_keeps_positions_across_the_date_line_together(tmp_path):
     assert data["ground"]["box"][2] == pytest.approx(222.6 + 2 * 30, rel=0.01)
 
 
-def test_report_makes_a_page_without_the_map(flown, tmp_path):
+def test_report_writes_a_page_without_the_map(flown, tmp_path):
     log = write_log(tmp_path / "log", ("start", {"map": str(tmp_path / "gone.gpkg")}), ("query", query("a")))
     assert run("report", log, "--out", tmp_path / "out.html") == 0
     data = data_of((tmp_path / "out.html").read_text("utf-8"))
@@ -102,7 +102,7 @@ def test_report_makes_a_page_without_the_map(flown, tmp_path):
         (["empty", "--out", "out.html"], 1, "contains no flight-log lines"),
     ],
 )
-def test_report_refuses_what_cannot_be_done_in_a_sentence(tmp_path, monkeypatch, capsys, argv, code, said):
+def test_report_refuses_an_impossible_request_in_one_sentence(tmp_path, monkeypatch, capsys, argv, code, said):
     monkeypatch.chdir(tmp_path)
     write_log(tmp_path / "LOG", ("query", query("a")))
     (tmp_path / "empty").touch()

@@ -78,7 +78,7 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
         autopilot.finish()
 
 
-def test_read_track_takes_attitude_and_course_where_they_are_known(tmp_path):
+def test_read_track_uses_attitude_and_course_if_known(tmp_path):
     known, unknown = tmp_path / "known.csv", tmp_path / "unknown.csv"
     known.write_text("file,roll_deg,pitch_deg,yaw_deg,rel_alt,time,lat,lon,alt\n0.jpg,-12,7,300,80.5,0,50,8,100")
     unknown.write_text("file,time,lat,lon\n0.jpg,10,50.0,8.001\n1.jpg,0,50.0,8.0")

@@ -134,7 +134,7 @@ def test_fix_fails_with_gps_and_for_a_second_after_its_loss_and_is_denied_in_a_w
     assert flown.wait(1).fix() == ACCEPTED
 
 
-def test_plane_drifts_with_a_wind_that_it_does_not_know_until_a_fix_or_gps_brings_it_back():
+def test_plane_drifts_in_an_unknown_wind_until_a_fix_or_gps():
     known = Flown("arduplane", SIM_WIND_SPD=6).wait(20).set(SIM_GPS1_ENABLE=0)
     assert known.wait(60).error_m < 10
     flown = lose_gps("arduplane").wait(150)
@@ -151,7 +151,7 @@ def test_plane_drifts_with_a_wind_that_it_does_not_know_until_a_fix_or_gps_bring
     assert flown.fix() == FAILED
 
 
-def test_second_receiver_takes_over_and_one_that_jumps_is_not_followed_at_once():
+def test_second_receiver_takes_over_but_a_jump_is_not_followed_at_once():
     flown = Flown("arducopter", **SECOND).wait(5, gps_input()).set(SIM_GPS1_ENABLE=0).wait(25, gps_input())
     assert flown.error_m == pytest.approx(1, abs=0.2)
     assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
@@ -160,7 +160,7 @@ def test_second_receiver_takes_over_and_one_that_jumps_is_not_followed_at_once()
     assert flown.wait(5, gps_input()).brain.test_ratio < 1
 
 
-def test_copter_without_gps_loses_its_position_in_spite_of_a_fix():
+def test_copter_without_gps_loses_its_position_despite_a_fix():
     flown = lose_gps("arducopter").wait(4)
     assert flown.fix() == ACCEPTED
     assert flown.wait(2).flags & HAS_POSITION
@@ -181,7 +181,7 @@ def test_copter_without_gps_loses_its_position_in_spite_of_a_fix():
         (4, 0, 25, False),
     ],
 )
-def test_primary_receiver_is_that_with_more_satellites(switch, satellites, seconds, is_ours):
+def test_primary_receiver_has_more_satellites(switch, satellites, seconds, is_ours):
     flown = Flown("arducopter", GPS_AUTO_SWITCH=switch, **SECOND)
     receivers = flown.brain.receivers
     receivers._switched_s = flown.now_s
@@ -205,7 +205,7 @@ def test_receivers_are_chosen_or_blended_by_their_accuracies(told, parameters, e
     assert flown.error_m == pytest.approx(error_m, abs=0.1)
 
 
-def test_copter_flies_by_odometry_of_the_right_frame_and_quality():
+def test_copter_uses_odometry_of_the_correct_frame_and_quality():
     flown = Flown("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6, VISO_QUAL_MIN=10)
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
@@ -217,7 +217,7 @@ def test_copter_flies_by_odometry_of_the_right_frame_and_quality():
 USES_OURS = {"GPS2_TYPE": 14, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}
 
 
-def test_vehicle_that_obeys_its_estimate_is_flown_away_by_wrong_positions():
+def test_vehicle_that_follows_its_estimate_is_misled_by_wrong_positions():
     motion = Hover(ORIGIN, 60.0)
     flown = Flown("arducopter", motion, **USES_OURS)
     assert motion.away_m < 0.5
@@ -225,7 +225,7 @@ def test_vehicle_that_obeys_its_estimate_is_flown_away_by_wrong_positions():
     assert (motion.away_m, flown.error_m) == pytest.approx((10.0, 10.0), abs=0.5)
 
 
-def test_vehicle_that_receives_its_own_estimate_runs_away_with_a_tilt():
+def test_vehicle_that_receives_its_own_estimate_diverges_with_a_tilt():
     def make_own(flown):
         brain, message = flown.brain, gps_input(accuracy_m=5.0)(flown)
         message.lat, message.lon = (round(angle * 1e7) for angle in brain.point)
@@ -239,7 +239,7 @@ def test_vehicle_that_receives_its_own_estimate_runs_away_with_a_tilt():
     assert 0.3 < math.degrees(abs(flown.brain.tilt)) < 5
 
 
-def test_px4_takes_a_fix_at_any_time_and_names_no_frame():
+def test_px4_accepts_a_fix_at_any_time_and_has_no_frame():
     flown = Flown("px4-plane")
     assert flown.fix() == ACCEPTED, "with GPS too"
     assert flown.set(SIM_GPS1_ENABLE=0, SIM_WIND_SPD=6).wait(60).error_m > 200
@@ -268,7 +268,7 @@ def test_px4_fuses_odometry_by_another_flag():
     assert not flown.wait(1).flags & FUSES_ANY
 
 
-def test_px4_refuses_gps_that_contradicts_while_ours_is_active_and_resets_to_it_when_ours_is_silent():
+def test_px4_refuses_contradicting_gps_until_our_positions_stop():
     flown = lose_gps("px4-copter", wind_m_s=0).wait(10).wait(10, sensed(100.0))
     assert flown.error_m == pytest.approx(100, abs=10)
     flown.set(SIM_GPS1_ENABLE=1).wait(40, sensed(100.0))
@@ -279,13 +279,13 @@ def test_px4_refuses_gps_that_contradicts_while_ours_is_active_and_resets_to_it_
     assert not flown.flags & mavlink.ESTIMATOR_GPS_GLITCH
 
 
-def test_px4_beside_good_gps_refuses_ours_that_contradict_and_fuses_those_within_the_gate():
+def test_px4_with_good_gps_fuses_only_our_positions_within_the_gate():
     flown = Flown("px4-copter").wait(20, sensed(100.0))
     assert flown.error_m < 0.1
     assert 0.05 < flown.wait(20, sensed(2.0)).error_m < 1
 
 
-def test_px4_stops_to_fuse_a_receiver_that_is_flagged_as_spoofed_after_seven_seconds():
+def test_px4_stops_fusing_a_spoofed_receiver_after_seven_seconds():
     flown = Flown("px4-copter").set(SIM_GPS_SPOOF=1)
     assert flown.wait(6).flags & FUSES
     assert not flown.wait(3).flags & FUSES

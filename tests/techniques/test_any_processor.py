@@ -81,11 +81,11 @@ def report(what, *parts):
 
 @pytest.mark.process
 @pytest.mark.parametrize("processor", [{}, *_PROCESSORS.values()], ids=["this one", *_PROCESSORS])
-def test_all_that_is_made_of_a_picture_is_the_same_whatever_the_processor_can_do(processor):
+def test_descriptors_are_identical_on_any_processor(processor):
     assert compute_checksums(**processor) == CHECKSUMS
 
 
-def test_a_query_is_turned_to_the_same_picture():
+def test_warp_picture_is_identical_for_rotated_queries():
     """Where there is FMA: without it some pixels differ, which no map holds."""
     technique = create("cohog", {"camera": "nadir"})
     turned, allowed, _ = technique._make_views(technique.encode(whole_numbers()))._warp_picture(1.0, 5)

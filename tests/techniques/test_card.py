@@ -14,7 +14,7 @@ from edgevpr.techniques.session import open_backbone
 SHA256 = "0" * 64
 
 
-def test_the_users_card_of_a_name_comes_before_the_shipped_one(tmp_path, monkeypatch):
+def test_load_card_prefers_the_users_card_to_the_shipped_one(tmp_path, monkeypatch):
     monkeypatch.delenv("EDGEVPR_MODELS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert list_model_folders() == (tmp_path / "edgevpr" / "models", find_shipped("models"))
@@ -22,7 +22,7 @@ def test_the_users_card_of_a_name_comes_before_the_shipped_one(tmp_path, monkeyp
     assert load_card("calc").title == "My own"
 
 
-def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
+def test_fingerprint_changes_with_everything_that_affects_a_descriptor(models):
     whole = {"file": "tiny.onnx", "sha256": SHA256}
     found = {
         read_card(write_card(models / "tiny.yaml", {**whole, **changes})).fingerprint
@@ -57,7 +57,7 @@ def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
         ({"path": "/etc"}, "`path` must be"),
     ],
 )
-def test_a_wrong_card_is_one_sentence_that_names_it(models, changes, says):
+def test_load_card_refuses_an_invalid_card_in_one_sentence(models, changes, says):
     path = write_card(models / "tiny.yaml", {"file": "tiny.onnx", "sha256": SHA256, **changes})
     with pytest.raises(EdgevprError, match=says) as raised:
         load_card("tiny")
@@ -65,7 +65,7 @@ def test_a_wrong_card_is_one_sentence_that_names_it(models, changes, says):
     assert "\n" not in str(raised.value)
 
 
-def test_a_missing_key_and_a_missing_card_are_said(models):
+def test_load_card_reports_a_missing_key_and_a_missing_card(models):
     path = write_card(models / "tiny.yaml", {"sha256": SHA256})
     path.write_text(path.read_text().replace("licence", "#"))
     with pytest.raises(ModelError, match="licence"):
@@ -76,7 +76,7 @@ def test_a_missing_key_and_a_missing_card_are_said(models):
         load_card("../tiny")
 
 
-def test_a_card_makes_a_technique_of_its_name(models):
+def test_create_makes_a_technique_from_a_card(models):
     write_network(models, "mine")
     assert "mine" in techniques.list_techniques()
     assert techniques.read_parameters("mine") == {"form": "float", "threads": 1}
@@ -90,7 +90,7 @@ def test_a_card_makes_a_technique_of_its_name(models):
         assert techniques.create("mine", {"form": form}).min_margin > 1
 
 
-def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models):
+def test_list_techniques_excludes_backbones_and_survives_a_broken_card(models):
     write_network(models, "mine", card={"outputs": {"features": "features"}})
     write_card(models / "broken.yaml", {"sha256": "no"})
     write_network(models, "good")
@@ -102,7 +102,7 @@ def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models)
         techniques.create("broken")
 
 
-def test_a_card_may_be_called_like_a_technique(models):
+def test_list_techniques_accepts_a_card_named_like_a_technique(models):
     write_network(models, "calc")
     assert techniques.list_techniques().count("calc") == 1
     assert techniques.create("calc").spec.parameters == {"model": "calc"}

@@ -39,13 +39,13 @@ def test_ground_in_little_light_and_in_fog_is_found(camera, worse):
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("size", [(480, 640), (120, 160)])
 @pytest.mark.parametrize("level", [0, 10, 170])
-def test_sensor_noise_does_not_become_ground(camera, size, level):
+def test_stretch_contrast_does_not_turn_sensor_noise_into_ground(camera, size, level):
     technique = create("cohog", {"camera": camera})
     for sigma in (0, 1, 3):
         assert technique.encode(noisy(np.full(size, level), sigma)).quality < technique.min_quality
 
 
-def test_a_picture_is_stretched_the_more_the_less_it_holds_and_without_a_jump():
+def test_stretch_contrast_stretches_low_contrast_more_and_continuously():
     plenty = ramp(50, 160)
     assert stretch_contrast(plenty, None, PIXEL_PX, *DOUBLED) is plenty
     inner = slice(8, -8)  # the ends of the range may be cut off
@@ -58,7 +58,7 @@ def test_a_picture_is_stretched_the_more_the_less_it_holds_and_without_a_jump():
     assert ranges[-1] == pytest.approx(200, abs=8), "never to more than what is wanted"
 
 
-def test_what_is_masked_changes_nothing_of_what_is_not():
+def test_make_grey_square_ignores_masked_pixels():
     dim = make_grey_square(noisy(0.15 * textured(1, 480, 640), 1), 512)
     allowed = np.ones((512, 512), bool)
     allowed[200:300, 100:400] = False

@@ -22,7 +22,7 @@ def count_by_hand(asking, best, side, counts):
 
 
 @pytest.mark.parametrize("counts", [(1.0,), (1.0, 1.0), (1.0, 0.5), (1.0, 1.0, 0.75, 0.5)])
-def test_the_share_is_that_of_the_step_with_the_most_votes_about_it(counts):
+def test_find_displacement_counts_votes_around_the_most_frequent_displacement(counts):
     rng = np.random.default_rng(len(counts))
     asking = np.sort(rng.choice(49, 40, replace=False))
     best = rng.integers(0, 49, 40)
@@ -31,7 +31,7 @@ def test_the_share_is_that_of_the_step_with_the_most_votes_about_it(counts):
     )
 
 
-def test_votes_beside_the_peak_move_it_by_less_than_a_cell():
+def test_find_displacement_refines_the_peak_within_a_cell():
     asking = np.arange(900)[np.arange(900) % 30 < 25]
     moved = np.where(np.arange(len(asking)) % 4, 1, 2)  # three of four moved by one cell, one by two
     found = find_displacement(asking, asking + moved, (30, 30), (1.0, 0.5))
@@ -52,7 +52,7 @@ def test_cohog_finds_how_far_a_picture_has_moved():
     assert match.score > 0.4 > 0.2 > technique.match(stranger, reference.fine).score
 
 
-def test_a_region_that_many_resemble_agrees_once():
+def test_find_displacement_counts_a_region_that_resembles_many_once():
     asking, best = np.arange(20, 27), np.array([120, 121, 121, 121, 121, 121, 150])
     found = find_displacement(asking, best, (31, 31), (1.0, 1.0, 1.0, 1.0))
     assert found.coverage == 2 / 31**2, "120 and 121; 150 has moved by another step"
@@ -87,7 +87,7 @@ def support_by_hand(asking, regions, reference, step):
 
 @pytest.mark.parametrize("step", [(0.0, 0.0), (2.3, -1.2), (-4.0, 3.6), (9.0, 9.0), (30.0, 0.0)])
 @pytest.mark.parametrize("asked", [1, 40, 100])
-def test_the_support_of_a_step_is_that_of_all_regions(step, asked):
+def test_support_is_computed_from_all_regions(step, asked):
     rng = np.random.default_rng(asked)
     # Integers, so that sums are exact in any order; the query is the place, moved, with other regions among it.
     reference = rng.integers(-9, 10, (100, 8)).astype(np.float32)
@@ -127,14 +127,14 @@ def align(asking, best, shift_cells):
     ("shift", "turn_deg", "scale"), [((0.0, 0.0), 0.0, 1.0), ((3.3, -5.6), 7.0, 1.18), ((-8.2, 2.4), -7.4, 0.84)]
 )
 @pytest.mark.parametrize("wrong", [0.0, 0.7])
-def test_shift_rotation_and_scale_are_found_among_pairs_that_are_wrong(shift, turn_deg, scale, wrong):
+def test_align_finds_shift_rotation_and_scale_despite_outliers(shift, turn_deg, scale, wrong):
     found = align(*make_pairs(shift, turn_deg, scale, wrong=wrong), shift_cells=tuple(np.rint(shift)))
     assert found.shift_cells == pytest.approx(shift, abs=0.15)
     assert found.rotation_deg == pytest.approx((350 + turn_deg) % 360, abs=0.7)
     assert found.height_ratio == pytest.approx(2 * scale, abs=0.03)
 
 
-def test_the_covariance_is_that_of_pairs_which_lie_off():
+def test_covariance_comes_from_the_residuals_of_pairs():
     exact = align(*make_pairs((0.0, 0.0), 0.0, 1.0), shift_cells=(0.0, 0.0))
     assert exact.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
     mixed = align(*make_pairs((0.0, 0.0), 0.0, 1.0, wrong=0.8), shift_cells=(0.0, 0.0))
@@ -145,7 +145,7 @@ def is_as_it_was(match):
     return match.covariance_cells2 is None and (match.rotation_deg, match.height_ratio) == (350.0, 2.0)
 
 
-def test_pairs_of_different_places_and_too_few_are_not_aligned():
+def test_align_refuses_too_few_pairs_and_those_of_different_places():
     asking, best = make_pairs((0.0, 0.0), 0.0, 1.0)
     assert is_as_it_was(align((asking[0][:7], SIDE), (best[0][:7], SIDE), (0.0, 0.0)))
     assert is_as_it_was(align(asking, best, (40.0, 40.0)))

@@ -27,7 +27,7 @@ def test_fit_perspective_finds_the_slope_among_wrong_pairs(slope):
     assert regions == pytest.approx(np.count_nonzero(~wrong), abs=20)
 
 
-def test_fit_perspective_knows_nothing_of_few_pairs():
+def test_fit_perspective_is_none_for_few_pairs():
     known = np.full(len(GRID), 40 + 40j)
     known[:11] = GRID[:11]
     assert fit_perspective(GRID, known, 1 + 0j, 0j) is None

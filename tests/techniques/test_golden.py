@@ -23,7 +23,7 @@ def test_filled_bins_of_radius_5_tops_out_below_one():
     assert entropy.compute_filled_bins(all_different).max() == pytest.approx(np.log2(81) / 8, abs=1e-6)
 
 
-def test_shannon_is_the_entropy_of_the_disc():
+def test_shannon_entropy_equals_that_of_the_disc():
     image = textured(4, 128, 128)
     np.testing.assert_allclose(entropy.compute_shannon(image), literal.shannon(image), atol=1e-5)
 

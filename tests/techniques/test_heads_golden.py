@@ -21,18 +21,18 @@ SIGNED = np.random.default_rng(9).normal(size=(5, 7, 9)).astype(np.float32)
 
 
 @pytest.mark.parametrize("levels", [1, 4, 7])
-def test_pyramid(levels):
+def test_pool_pyramid_equals_the_literal_loop(levels):
     expected = literal.pyramid(SIGNED, range(1, levels + 1)).astype(np.float32)
     np.testing.assert_array_equal(network.pool_pyramid(SIGNED, levels), expected)
 
 
-def test_what_is_too_small_is_refused():
+def test_make_square_regions_refuses_too_small_a_map():
     with pytest.raises(ModelError, match="R-MAC"):
         regions.make_square_regions(1, 30)
 
 
 @pytest.mark.parametrize(("size", "length"), [(60, 20), (61, 61), (2, 1)])
-def test_projection_is_the_product_with_its_matrix(size, length):
+def test_projection_equals_the_product_with_its_matrix(size, length):
     vector = np.random.default_rng(3).normal(size=size).astype(np.float32)
     row, signs = network.make_gaussian_row(size, seed=5)
     project = network.make_gaussian_projection(size, length, seed=5)
@@ -40,7 +40,7 @@ def test_projection_is_the_product_with_its_matrix(size, length):
     np.testing.assert_allclose(project(vector), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_gaussian_row_is_the_same_everywhere_and_for_ever():
+def test_make_gaussian_row_is_reproducible():
     row, signs = network.make_gaussian_row(5, seed=7)
     np.testing.assert_allclose(row, ROW_OF_SEED_7, rtol=1e-12)
     assert signs.tolist() == SIGNS_OF_SEED_7
@@ -65,7 +65,7 @@ def test_rmac_vectors_and_aggregate():
 
 
 @pytest.mark.parametrize("soft", [None, 3.0, 50.0])
-def test_vlad(soft):
+def test_compute_vlad_equals_the_literal_loop(soft):
     local = words.make_local_descriptors(SIGNED)
     np.testing.assert_allclose(np.linalg.norm(local, axis=1), 1, rtol=1e-5)
     np.testing.assert_allclose(local[9 + 2], SIGNED[:, 1, 2] / np.linalg.norm(SIGNED[:, 1, 2]), rtol=1e-5)
@@ -74,13 +74,13 @@ def test_vlad(soft):
     np.testing.assert_allclose(words.compute_vlad(local, known, soft), expected, rtol=1e-3, atol=1e-4)
 
 
-def test_a_word_that_nothing_falls_to_stays_zero():
+def test_compute_vlad_leaves_an_unused_word_zero():
     local = np.tile(np.float32([[1, 0]]), (4, 1))
     known = np.float32([[0.9, 0.1], [-1, 0]])
     np.testing.assert_allclose(words.compute_vlad(local, known), [0.70710678, -0.70710678, 0, 0], atol=1e-6)
 
 
-def test_sharpness_gives_a_word_a_hundred_times_the_weight_of_the_next():
+def test_compute_sharpness_weights_a_word_a_hundred_times_the_next():
     known = np.float32([[0, 0], [3, 0], [0, 3], [3, 3]])
     weights = words.compute_soft_weights(known, known, words.compute_sharpness(known))
     nearest_two = np.sort(weights, axis=1)[:, :-3:-1]
@@ -101,14 +101,14 @@ def test_regions_are_the_most_energetic_connected_activations(dead, count):
         np.testing.assert_allclose(vector, literal.under_box(features, pixels), rtol=1e-4, atol=1e-5)
 
 
-def test_equal_regions_come_by_channel_and_position():
+def test_equal_regions_are_sorted_by_channel_and_position():
     features = np.zeros((2, 5, 5), np.float32)
     features[:, 0, 4] = features[:, 0, 0] = features[:, 4, 2] = 1
     boxes = regions.find_regions(features, 4)
     assert boxes[:, :2].tolist() == [[0, 0], [0, 4], [4, 2], [0, 0]]
 
 
-def test_mutual_score():
+def test_score_mutual_pairs_equals_the_literal_loop():
     rng = np.random.default_rng(8)
     query, place = words.normalise_rows(rng.normal(size=(6, 4))), words.normalise_rows(rng.normal(size=(9, 4)))
     assert regions.score_mutual_pairs(query, place) == pytest.approx(literal.mutual_score(query, place))
@@ -118,7 +118,7 @@ def test_mutual_score():
     assert regions.score_mutual_pairs(query, padded) == pytest.approx(regions.score_mutual_pairs(query, place))
 
 
-def test_directions_survive_8_bits():
+def test_to_bytes_keeps_directions_in_8_bits():
     vectors = np.concatenate([words.normalise_rows(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
     back = regions.from_bytes(regions.to_bytes(vectors.astype(np.float32)))
     assert (np.einsum("nd,nd->n", back, vectors)[:20] > 0.9998).all()

@@ -25,7 +25,7 @@ def town():
     return technique, np.stack([technique.encode(view(seed)).coarse for seed in range(PLACES)])
 
 
-def test_layouts_agree_on_the_shift_between_them():
+def test_compute_agreement_is_high_at_the_shift_between_two_layouts():
     ground = np.random.default_rng(3).normal(size=(12, 20, 20)).astype(np.float32)
     ground /= np.linalg.norm(ground, axis=0)
     place, query = ground[:, 4:16, 4:16], ground[:, 6:18, 3:15]  # the camera is a cell to the left, and two below
@@ -38,7 +38,7 @@ def test_layouts_agree_on_the_shift_between_them():
 
 
 @pytest.mark.parametrize("step", range(layout.ROTATIONS))
-def test_a_turned_and_moved_camera_finds_the_place_and_its_rotation(town, step):
+def test_score_places_finds_place_and_rotation_of_a_moved_camera(town, step):
     technique, rows = town
     query = technique.encode(view(step % PLACES, 15 * step, *SHIFTS_PX[step % len(SHIFTS_PX)]))
     scores, by_hypothesis = technique.score_places(query, rows, None)
@@ -46,7 +46,7 @@ def test_a_turned_and_moved_camera_finds_the_place_and_its_rotation(town, step):
     assert by_hypothesis[step % PLACES].argmax() % layout.ROTATIONS == step
 
 
-def test_only_likely_places_are_looked_at_closer(town):
+def test_score_places_examines_only_likely_places_closely(town):
     technique, rows = town
     query = technique.encode(view(1))
     _, by_hypothesis = technique.score_places(query, rows, None)
@@ -60,7 +60,7 @@ def test_only_likely_places_are_looked_at_closer(town):
 
 
 @pytest.mark.parametrize("headings", [False, True])
-def test_in_a_large_map_the_places_in_reach_are_all_scored_and_of_the_others_some(town, headings):
+def test_score_places_scores_all_places_in_reach_and_some_others_of_a_large_map(town, headings):
     technique, rows = town
     query = technique.encode(view(1))
     large = np.repeat(rows, 12_000 // PLACES, axis=0)
@@ -87,7 +87,7 @@ def test_rows_of_any_bytes_have_finite_scores(town):
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * len(damaged)
 
 
-def test_a_picture_without_a_good_region_has_no_layout_and_is_like_no_place(town):
+def test_score_places_matches_nothing_without_a_good_region(town):
     technique, rows = town
     empty = technique.encode(np.full((SIDE_PX, SIDE_PX), 90, np.uint8))
     assert (empty.coarse == NOTHING).all()
@@ -105,7 +105,7 @@ def possible(by_hypothesis):
 
 
 @pytest.mark.slow
-def test_only_the_rotation_expected_and_those_beside_it_are_possible(town):
+def test_score_places_allows_only_rotations_near_the_expected_one(town):
     technique, rows = town
     query, rows = technique.encode(view(0)), np.resize(rows, (8, PLACE_BYTES))
     rotation_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])

@@ -27,12 +27,12 @@ from edgevpr.techniques.session import open_backbone
         ("rmac", {"model": "kalc"}, ModelError, "did you mean `calc`"),
     ],
 )
-def test_what_cannot_be_is_said_before_take_off(name, settings, error, says):
+def test_create_refuses_invalid_settings_before_take_off(name, settings, error, says):
     with pytest.raises(error, match=says):
         create(name, settings)
 
 
-def test_a_picture_without_any_region_says_nothing(models):
+def test_score_places_is_zero_for_an_image_without_regions(models):
     write_network(models, "dim", fault="below zero in the dark", card={"input": {**CARD["input"], "mean": [0.0]}})
     sha256 = open_backbone("dim", "features").sha256
     for kind, count in (("regions", 12), ("bow", 40)):

@@ -35,7 +35,7 @@ def patterns(seed):
 
 
 @pytest.mark.parametrize(("rotation_deg", "right_px", "down_px", "height"), [(0, 24, -16, 1), (40, 8, 30, 1.2)])
-def test_a_query_is_laid_as_its_match_says(rotation_deg, right_px, down_px, height):
+def test_overlay_query_follows_the_match(rotation_deg, right_px, down_px, height):
     ground = make_ground(1)
     match = FineMatch(
         0.1,
@@ -49,13 +49,13 @@ def test_a_query_is_laid_as_its_match_says(rotation_deg, right_px, down_px, heig
     assert np.corrcoef(laid[inside], view(ground)[inside])[0, 1] > 0.98
 
 
-def test_another_structure_does_not_stand_out():
+def test_measure_prominence_is_low_for_another_structure():
     place = structure(patterns(0), SEEN)
     others = [overlay.measure_prominence(structure(patterns(seed), SEEN), place) for seed in range(1, 41)]
     assert max(others) < 2
 
 
-def test_what_agrees_when_pushed_along_does_not_stand_out():
+def test_measure_prominence_is_low_along_a_linear_structure():
     row = patterns(3)[:REGIONS]
     road = structure(np.repeat(row, REGIONS, axis=0), SEEN)  # each row is of one pattern
     assert overlay.measure_prominence(road, road) < 2
@@ -63,7 +63,7 @@ def test_what_agrees_when_pushed_along_does_not_stand_out():
     assert overlay.measure_prominence(furrows, furrows) < 3
 
 
-def test_regions_that_are_not_seen_say_nothing():
+def test_measure_prominence_ignores_regions_that_are_not_visible():
     some = np.zeros_like(SEEN)
     some[:4, :4] = True
     place = structure(patterns(1), SEEN)
@@ -73,7 +73,7 @@ def test_regions_that_are_not_seen_say_nothing():
     assert overlay.measure_prominence(structure(patterns(1), np.zeros_like(SEEN)), place) == 0
 
 
-def test_structures_agree_only_at_the_shift_that_is_asked_for():
+def test_structures_agree_only_at_the_given_shift():
     place = structure(patterns(1), SEEN)
     query = np.roll(place, (3, 9), axis=(0, 1))  # its middle lies to the left of the place's, and above
     there = overlay.compute_agreement(query, place, (-9.0, -3.0))
@@ -82,7 +82,7 @@ def test_structures_agree_only_at_the_shift_that_is_asked_for():
     assert overlay.compute_agreement(query, place, (400.0, -400.0)) < 3
 
 
-def test_a_match_of_changed_ground_stands_out():
+def test_match_of_changed_ground_is_prominent():
     technique = CoHog(camera="nadir")
     places = [np.dstack([view(make_ground(seed))] * 3).astype(np.uint8) for seed in range(4)]
     changed = view(make_ground(0), 33, 20, -12) * 0.6 + np.random.default_rng(0).normal(40, 12, (SIDE_PX, SIDE_PX))

@@ -40,7 +40,7 @@ def test_scan_codes_finds_the_place_of_a_moved_camera_and_how_far_it_moved(town,
     assert _best_shift(asked, codes[5]) == [right, down]
 
 
-def test_what_a_mask_hides_says_nothing(town):
+def test_make_grid_ignores_masked_blocks(town):
     grounds, mean, codes = town
     image = seen_from_above(grounds[2], 512)
     image[:, 256:] = 0  # part of the aircraft
@@ -63,7 +63,7 @@ def test_scan_codes_is_the_product_spelt_out(town):
 
 
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (1, 0), (1, 1), (-3, 2), (-1, -3)])
-def test_scan_in_two_steps_looks_at_the_best_of_many_places_under_every_shift(town, right, down):
+def test_score_places_scans_the_best_of_many_places_under_every_shift(town, right, down):
     grounds, mean, codes = town
     many = np.concatenate([np.random.default_rng(3).integers(0, 256, (5000, 144), dtype=np.uint8), codes])
     asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)

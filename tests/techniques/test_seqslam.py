@@ -36,7 +36,7 @@ def encode_rows(technique, count, first=0):
     return np.stack([technique.encode(textured(first + seed)).coarse for seed in range(count)])
 
 
-def test_the_picture_is_that_of_the_paper():
+def test_encode_makes_the_image_of_the_paper():
     technique = SeqSlam()
     picture = textured(3)
     small = cv2.resize(picture, (64, 32), interpolation=cv2.INTER_AREA)
@@ -49,7 +49,7 @@ def test_the_picture_is_that_of_the_paper():
     assert np.count_nonzero(difference) <= 2
 
 
-def test_light_and_contrast_change_nothing_and_a_flat_patch_says_so():
+def test_encode_ignores_light_and_contrast_and_marks_flat_patches():
     technique = SeqSlam()
     rng = np.random.default_rng(1)
     picture = rng.integers(0, 100, (32, 64), np.uint8)

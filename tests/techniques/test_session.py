@@ -14,7 +14,7 @@ from edgevpr.techniques.card import InputRule
 from edgevpr.techniques.session import fill_masked, open_backbone, prepare_input
 
 
-def test_both_outputs_of_a_network_and_their_shapes(models):
+def test_run_returns_both_outputs_with_their_shapes(models):
     write_network(models)
     features, descriptor = open_backbone("tiny", "features"), open_backbone("tiny", "descriptor")
     assert (features.shape, descriptor.shape) == (FEATURES, (16,))
@@ -27,7 +27,7 @@ def test_both_outputs_of_a_network_and_their_shapes(models):
     assert features.sha256 == descriptor.sha256 != features.card.sha256
 
 
-def test_a_batch_of_any_size_counts_as_one(models):
+def test_open_backbone_accepts_any_batch_size(models):
     write_network(models, fault="dynamic batch")
     assert open_backbone("tiny", "features").shape == FEATURES
 
@@ -42,7 +42,7 @@ def test_a_batch_of_any_size_counts_as_one(models):
         ("zeros", "outputs only zeros for `features`"),
     ],
 )
-def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, says):
+def test_open_backbone_refuses_an_unsuitable_file_in_one_sentence(models, monkeypatch, fault, says):
     write_network(models, fault=fault)
     monkeypatch.chdir(models)  # where weights in a second file would be found
     with pytest.raises(ModelError, match=says) as raised:
@@ -67,13 +67,13 @@ def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, sa
         ({"file": "gone.onnx"}, "features", "gone.onnx cannot be read"),
     ],
 )
-def test_a_card_that_does_not_fit_its_file_is_one_sentence(models, card, output, says):
+def test_open_backbone_refuses_a_card_that_does_not_fit_its_file_in_one_sentence(models, card, output, says):
     write_network(models, card=card)
     with pytest.raises(ModelError, match=says):
         open_backbone("tiny", output)
 
 
-def test_a_picture_of_which_nothing_is_made_is_refused_in_flight_too(models):
+def test_run_refuses_an_image_with_invalid_output(models):
     write_network(models)
     backbone = open_backbone("tiny", "features")
     for value, says in ((np.inf, "not finite"), (1e30, r"beyond 1e\+12"), (0, "zeros")):  # 1e30: of infinite length
@@ -97,7 +97,7 @@ class FakeSession:
 
 
 @pytest.mark.parametrize("threads", [-3, 0, 1000])
-def test_a_number_of_threads_that_makes_no_sense_is_a_wrong_request(models, threads):
+def test_open_backbone_refuses_an_invalid_number_of_threads(models, threads):
     write_network(models)
     with pytest.raises(UsageError, match=f"threads={threads}"):
         open_backbone("tiny", "features", threads)
@@ -117,7 +117,7 @@ except techniques.EdgevprError as error:
 
 
 @pytest.mark.process
-def test_without_onnxruntime_the_others_fly(models):
+def test_techniques_without_networks_need_no_onnxruntime(models):
     write_network(models)
     done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -135,7 +135,7 @@ def coloured(seed):
     return np.dstack([textured(seed), textured(seed + 10), textured(seed + 20)])
 
 
-def test_calc_sees_the_picture_as_its_paper_says():
+def test_calc_prepares_images_as_in_its_paper():
     image = coloured(1)
     it = rule(height=120, width=160, equalise=True, resize="cubic")
     yuv = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
@@ -148,7 +148,7 @@ def test_calc_sees_the_picture_as_its_paper_says():
     np.testing.assert_allclose(found[0, 0], expected, atol=1e-6)
 
 
-def test_colours_come_in_the_order_of_the_card():
+def test_run_orders_colours_as_in_the_card():
     image = np.zeros((12, 16, 3), np.uint8)
     image[:] = (10, 20, 30)  # blue, green, red
     assert prepare_input(image, rule(colour="bgr", scale=1.0))[0, :, 0, 0].tolist() == [10, 20, 30]
@@ -162,7 +162,7 @@ def test_scale_mean_and_deviation_in_this_order():
     np.testing.assert_allclose(prepare_input(image, it)[0, :, 5, 5], [0.2, 0.0, -0.05], atol=1e-6)
 
 
-def test_masked_pixels_become_the_mean_of_the_others():
+def test_run_replaces_masked_pixels_by_the_mean_of_the_others():
     image = coloured(3)
     mask = np.ones(image.shape[:2], bool)
     mask[:, 100:] = False

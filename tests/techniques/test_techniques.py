@@ -9,7 +9,7 @@ from edgevpr.techniques import create, list_techniques
 
 
 @pytest.mark.parametrize("name", list_techniques())
-def test_an_image_is_most_like_itself(name):
+def test_score_places_is_highest_for_the_same_image(name):
     technique = create(name)
     descriptors = [technique.encode(textured(seed)) for seed in range(4)]
     coarse = np.stack([d.coarse for d in descriptors])
@@ -27,7 +27,7 @@ def test_an_image_is_most_like_itself(name):
             assert 0 <= min(fine) <= max(fine) <= 1
 
 
-def test_a_picture_that_says_nothing_scores_nothing():
+def test_match_scores_zero_for_a_blank_image():
     technique = create("cohog")
     grey_wall = technique.encode(np.full((120, 160), 128, np.uint8))
     assert grey_wall.quality == 0
@@ -66,6 +66,6 @@ def test_encode_leaves_out_masked_pixels(name, parameters):
         ("hog", {"cell": 0}, "multiple of cell"),
     ],
 )
-def test_wrong_names_and_parameters_are_explained(name, parameters, says):
+def test_create_explains_wrong_names_and_parameters(name, parameters, says):
     with pytest.raises(UsageError, match=says):
         create(name, parameters)

@@ -66,7 +66,7 @@ def test_scores_are_those_of_a_literal_loop(form, similarity):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_map_of_one_place_or_of_the_same_place_has_finite_scores(form):
+def test_score_places_is_finite_for_one_place_or_identical_places(form):
     technique, coarse, mean, rows = made(form, "cosine", np.repeat(places(1), 3, axis=0))
     for query in (coarse[0], places(1, seed=3)[0], np.zeros(LENGTH)):
         scores, _ = technique.score_places(technique.encode(query.astype(np.float32)), rows, mean)
@@ -74,26 +74,26 @@ def test_a_map_of_one_place_or_of_the_same_place_has_finite_scores(form):
         assert ((scores >= 0) & (scores <= 1)).all()
 
 
-def test_a_form_may_have_its_own_rule():
+def test_form_has_its_own_default_margin():
     assert [Given(form).min_margin for form in FORMS] == [0.1, 0.2, 0.3]
     with pytest.raises(UsageError, match="2bit"):
         Given("2bit")
 
 
-def test_numbers_beyond_half_precision_are_an_error_and_not_infinite():
+def test_encode_refuses_values_beyond_half_precision():
     with pytest.raises(ModelError, match="half-precision range"):
         Given(similarity="l1").encode(np.full(LENGTH, 1e6, np.float32))
     assert Given().encode(np.full(LENGTH, 1e6, np.float32)).quality == 1
 
 
-def test_a_vector_of_zeros_says_that_it_says_nothing():
+def test_encode_gives_quality_zero_for_a_zero_vector():
     assert Given().encode(np.zeros(LENGTH, np.float32)).quality == 0
     assert Given(similarity="l1").encode(np.full(LENGTH, 1e-9, np.float32)).quality == 0  # zeros in half precision
     assert Given().encode(places(1)[0]).quality == 1
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_picture_of_nothing_is_like_no_place_not_even_like_another_of_nothing(form):
+def test_score_places_is_zero_for_a_blank_image_even_against_another(form):
     technique, nothing = Given(form), Given().encode(np.zeros(LENGTH, np.float32))
     coarse = np.stack([nothing.coarse, *(technique.encode(place).coarse for place in places(5))])
     mean = coarse.astype(np.float32).mean(axis=0)
@@ -103,7 +103,7 @@ def test_a_picture_of_nothing_is_like_no_place_not_even_like_another_of_nothing(
 
 @pytest.mark.parametrize("similarity", ["cosine", "l1"])
 @pytest.mark.parametrize("form", FORMS)
-def test_scoring_takes_little_beside_the_rows(form, similarity):
+def test_score_places_needs_little_memory_besides_the_rows(form, similarity):
     technique, _, mean, rows = made(form, similarity, places(16, length=4096))
     many = np.resize(rows, (8192, rows.shape[1]))  # as float32 all of them would be 134 MB
     query = technique.encode(places(1, length=4096)[0])

@@ -53,14 +53,14 @@ def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_sh
 
 
 @pytest.mark.parametrize("height_ratio", [0.5, 1.0, 2.0])
-def test_no_height_lets_other_ground_be_accepted(town, height_ratio):
+def test_match_accepts_no_other_ground_at_any_height(town, height_ratio):
     technique, places, _ = town
     query = technique.encode(seen(11, height_ratio))
     for place in places[:2]:
         assert technique.match(query, place.fine).score < technique.min_score
 
 
-def test_one_height_is_looked_from_and_the_others_left_out(town):
+def test_score_places_searches_only_the_given_height(town):
     technique, _, rows = town
     query = technique.encode(seen(2, 0.7))
     for expected, number in ((None, 2), (0.66, 1), (1.1, 2), (3.0, 4)):
@@ -71,7 +71,7 @@ def test_one_height_is_looked_from_and_the_others_left_out(town):
         assert (scores >= 0).all()
 
 
-def test_the_score_of_the_thesis_is_tried_from_one_height():
+def test_thesis_score_is_searched_at_one_height():
     technique = create("cohog", {"camera": "nadir", "matching": "thesis"})
     assert not technique.spec.height_ratios
     query = technique.encode(seen(1))

@@ -47,20 +47,20 @@ def test_words_of_another_network_are_refused(folder):
         ({"words": np.array([{}, {}, {}], object)}, "cannot be read"),
     ],
 )
-def test_damaged_words_are_refused(folder, changes, says):
+def test_load_words_refuses_damaged_files(folder, changes, says):
     write(folder, **changes)
     with pytest.raises(ModelError, match=says):
         words.load_words("tiny", "vlad", 3)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_none_is_refused(folder, content):
+def test_load_words_refuses_another_file(folder, content):
     (folder / "tiny_vlad3.npz").write_bytes(content)
     with pytest.raises(ModelError, match="tiny_vlad3"):
         words.load_words("tiny", "vlad", 3)
 
 
-def test_bag_of_words():
+def test_compute_bag_of_words_equals_the_literal_loop():
     rng = np.random.default_rng(2)
     local, known = rng.normal(size=(30, 4)).astype(np.float32), rng.normal(size=(20, 4)).astype(np.float32)
     np.testing.assert_allclose(words.compute_bag_of_words(local, known), literal.bag_of_words(local, known), rtol=1e-6)

@@ -49,7 +49,7 @@ def test_positions_places_the_pictures_of_a_flight_while_the_autopilot_had_gps(t
     assert (tags["000001.jpg"].roll_deg, tags["000001.jpg"].height_m) == (3.0, 80.0)
 
 
-def test_a_flight_that_was_not_recorded_gets_a_sentence(tmp_path):
+def test_read_record_refuses_a_flight_without_a_recording_in_one_sentence(tmp_path):
     with FlightLog(tmp_path / "flight.jsonl") as log:
         log.write("start", recording=None)
         log.write("query", query="frame 0", t_frame_s=FRAME_S, vehicle=vehicles()[0])
@@ -57,7 +57,7 @@ def test_a_flight_that_was_not_recorded_gets_a_sentence(tmp_path):
         read_record(tmp_path / "flight.jsonl")
 
 
-def test_a_flight_over_a_folder_of_pictures_gets_a_sentence(tmp_path):
+def test_read_record_refuses_a_flight_over_a_folder_in_one_sentence(tmp_path):
     log, _ = fly(tmp_path, is_live=False)
     with pytest.raises(UsageError, match="not from a camera"):
         read_record(log)

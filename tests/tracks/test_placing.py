@@ -40,7 +40,7 @@ def points(count=15, lat_step=1e-4):
     return [(t, HOME[0] + lat_step * t, HOME[1], 120.0, 30.0, 0.0, 0.0, 0.0) for t in range(count)]
 
 
-def test_positions_places_pictures_by_their_names(capsys, folder, tmp_path):
+def test_positions_assigns_images_by_name(capsys, folder, tmp_path):
     rows = "".join(f"D:\\pics\\img_{number}.tif;50.{number + 1};8\n" for number in range(5))
     (tmp_path / "table.csv").write_text(f"imagename;latitude;longitude\n{rows}")
     assert run("positions", tmp_path / "table.csv", "--images", folder) == 0
@@ -59,7 +59,7 @@ def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
     assert [tag.position.lat_deg for tag in tags.values()] == pytest.approx([50 + 1e-3 * number for number in range(6)])
 
 
-def test_positions_goes_by_time_where_the_numbers_of_pictures_differ(capsys, folder, tmp_path):
+def test_positions_assigns_images_by_time_if_their_number_differs(capsys, folder, tmp_path):
     write_dataflash(tmp_path / "f.bin", points(), shots=points(3))
     found = run_json(capsys, "positions", tmp_path / "f.bin", "--images", folder)
     assert (found["placed"], found["offset_s"]) == (6, 0)

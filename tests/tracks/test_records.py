@@ -22,7 +22,7 @@ def agrees(tag, point, of_height=True):
 
 
 @pytest.mark.parametrize(("ending", "write"), [(".bin", write_dataflash), (".tlog", write_tlog)])
-def test_a_log_gives_the_track_and_what_was_written_down_of_each_picture(tmp_path, ending, write):
+def test_read_record_reads_track_and_camera_messages_of_a_log(tmp_path, ending, write):
     path = tmp_path / f"flight{ending}"
     write(path, POINTS, SHOTS)
     record = read_record(path)
@@ -35,7 +35,7 @@ def test_a_log_gives_the_track_and_what_was_written_down_of_each_picture(tmp_pat
 
 
 @pytest.mark.parametrize(("ending", "write"), [(".bin", write_dataflash), (".tlog", write_tlog)])
-def test_a_log_that_was_cut_off_is_read_to_there_and_nothing_is_printed(tmp_path, capfd, ending, write):
+def test_read_record_reads_a_truncated_log_without_output(tmp_path, capfd, ending, write):
     path = tmp_path / f"flight{ending}"
     write(path, POINTS)
     path.write_bytes(path.read_bytes()[:-30] + b"\x00" * 600)
@@ -60,7 +60,7 @@ def px4(position="vehicle_global_position"):
     return topics
 
 
-def test_a_log_of_px4_is_told_the_time_by_its_receiver(tmp_path):
+def test_read_record_reads_the_time_of_a_px4_log_from_its_receiver(tmp_path):
     write_ulog(tmp_path / "flight.ulg", px4() | {"camera_capture": px4("camera_capture")["camera_capture"]})
     record = read_record(tmp_path / "flight.ulg")
     assert record.track.t_s == pytest.approx([START_S + t for t in range(6)], abs=0.01)
@@ -71,7 +71,7 @@ def test_a_log_of_px4_is_told_the_time_by_its_receiver(tmp_path):
         assert tag.position.lon_deg == pytest.approx(8.5)
 
 
-def test_a_gpx_track_goes_by_the_time_and_one_without_times_is_refused(tmp_path):
+def test_read_record_requires_times_in_a_gpx_track(tmp_path):
     path = tmp_path / "walk.gpx"
     write_gpx(path, [(t, 50 + 1e-4 * t, 8) for t in range(4)])
     record = read_record(path)
@@ -108,7 +108,7 @@ SUBTITLES = {
 
 
 @pytest.mark.parametrize("form", SUBTITLES)
-def test_subtitles_of_each_form_are_read(tmp_path, form):
+def test_read_record_reads_each_subtitle_format(tmp_path, form):
     block, alt_m, height_m, turned = SUBTITLES[form]
     text = "".join(f"{at + 1}\n00:00:{at:02},500 --> 00:00:{at + 1:02},500\n{block}\n\n" for at in range(3))
     (tmp_path / "film.SRT").write_text("\ufeff" + text)
@@ -160,7 +160,7 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
         ("t.gpx", b"<gpx", "GPX"),
     ],
 )
-def test_read_record_refuses_what_is_none_in_a_sentence(tmp_path, name, content, said):
+def test_read_record_refuses_other_files_in_one_sentence(tmp_path, name, content, said):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UsageError, match=said):
         read_record(tmp_path / name)

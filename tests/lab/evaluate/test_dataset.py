@@ -45,7 +45,7 @@ def test_load_dataset_reads_a_query_off_the_map(folder, row):
     assert dataset.unscored == 1
 
 
-def test_load_dataset_reads_a_file_of_a_spreadsheet_that_leaves_queries_out(folder):
+def test_load_dataset_reads_a_spreadsheet_export_without_some_queries(folder):
     dataset = load(folder, b"\xef\xbb\xbfquery_file,ref_files\r\n b.png , b.png \r\n\r\n")
     assert [(query.path.name, query.right) for query in dataset.queries] == [("b.png", {"b.png"})]
 
@@ -91,7 +91,7 @@ def right_of(dataset):
 
 
 @pytest.mark.parametrize("inside", ["", "images/test"])
-def test_open_folder_reads_names_with_utm(tmp_path, inside):
+def test_open_folder_reads_utm_coordinates_from_names(tmp_path, inside):
     places = {"@0500000.00@4100000.00@10@S@.jpg", "@0500020@4100000@.jpg"}
     write_pictures(tmp_path / inside / "database", places)
     queries = tmp_path / inside / "queries"

@@ -56,7 +56,7 @@ def test_evaluate_measures_recall_costs_and_sizes(folder, name, parameters):
     assert result.descriptor_bytes == sizes[name]
 
 
-def test_evaluate_counts_a_match_that_was_accepted_off_the_map(folder):
+def test_evaluate_counts_a_match_accepted_off_the_map(folder):
     cv2.imwrite(
         str(folder / "ref" / "r7.png"), textured(7)
     )  # its twin is in the map, and the truth has no place for it
@@ -74,7 +74,7 @@ def test_evaluate_ignores_a_loose_reference_and_counts_the_next(folder):
     assert (result.accepted, result.accepted_wrong) == (1, 0)
 
 
-def test_evaluate_says_what_could_not_be_done_to_the_map(folder, monkeypatch):
+def test_evaluate_reports_failed_steps_of_the_map(folder, monkeypatch):
     def lack_scipy(*_):
         raise UsageError("SciPy is missing.")
 
@@ -85,7 +85,7 @@ def test_evaluate_says_what_could_not_be_done_to_the_map(folder, monkeypatch):
     assert evaluate(folder, "hog", HOG).not_done == (), "it has no confidence to calibrate"
 
 
-def test_from_json_gives_the_same_tables(folder):
+def test_read_result_gives_the_same_tables_from_json(folder):
     (result,) = add_pcu([evaluate(folder, "hog", HOG)])
     read_back = json.loads(json.dumps(asdict(result), allow_nan=False))
     assert format_results([read_result({**read_back, "other": 1})]) == format_results([result])

@@ -23,7 +23,7 @@ def figures_of(*queries):
     return metrics.Quality(technique="", references=10, **both)
 
 
-def test_compute_both_of_a_faultless_run_with_ties():
+def test_compute_quality_of_a_perfect_run_with_ties():
     found = figures_of((0.9, 0), (0.9, 0), (0.5, 0), (0.5, 0))
     assert (found.auc_from_zero, found.auc_2_3) == (1, 0.5), "2.3 takes half of it for the ties"
     assert (found.ep, found.precision_at_100_recall, found.roc_auc) == (1, 1, None)
@@ -31,7 +31,7 @@ def test_compute_both_of_a_faultless_run_with_ties():
     assert (found.queries_off_map, found.with_match) == (0, None)
 
 
-def test_compute_both_counts_queries_off_the_map():
+def test_compute_quality_counts_queries_off_the_map():
     # By falling score: right, off the map, right, wrong (third), right.
     found = figures_of((0.9, 0), (0.8, NEVER, False), (0.7, 0), (0.6, 2), (0.5, 0))
     assert (found.queries, found.queries_off_map) == (5, 1)
@@ -52,7 +52,7 @@ def test_compute_both_counts_queries_off_the_map():
 
 
 @pytest.mark.parametrize("score", [0.3, -math.inf])
-def test_compute_both_where_no_query_has_a_match(score):
+def test_compute_quality_without_any_match(score):
     found = figures_of((score, NEVER, False), (score, NEVER, False))
     assert (found.queries_off_map, found.with_match) == (2, None)
     shares = (found.recall_at_10, found.auc_from_zero, found.auc_2_3, found.ep, found.precision_at_100_recall)
@@ -60,12 +60,12 @@ def test_compute_both_where_no_query_has_a_match(score):
     assert (found.recall_at_100_precision_vpr_tutorial, found.roc_auc) == (0, None)
 
 
-def test_precision_recall_accepts_no_query_that_found_nothing():
+def test_precision_recall_never_accepts_a_query_without_a_match():
     precision, recall = metrics.precision_recall([-math.inf, 0.5, -math.inf], [False, True, False])
     assert (precision.tolist(), recall.tolist()) == ([1], [1])
 
 
-def test_first_right_is_the_rank_of_the_first_right_reference():
+def test_rank_of_first_correct_is_the_rank_of_the_first_correct_reference():
     right = np.array([False, True, False, True])
     assert [metrics.rank_of_first_correct(np.array(order), right) for order in ([1, 0], [0, 2, 3, 1], [2, 0])] == [
         0,
@@ -81,7 +81,7 @@ def test_pcu_of_the_slowest_technique_is_its_precision():
 
 
 @pytest.mark.parametrize(("right", "of"), [(0, 1), (0, 20), (13, 20), (20, 20)])
-def test_interval_is_that_of_wilson(right, of):
+def test_wilson_interval_equals_published_values(right, of):
     expected = stats.binomtest(right, of).proportion_ci(method="wilson")
     assert wilson_interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
 

@@ -42,7 +42,7 @@ def orthophoto(tmp_path_factory):
         ({"heading_deg": 45, "roll_deg": -6, "pitch_deg": 7, "height_m": 60}, (-8, 5)),
     ],
 )
-def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change, off_m):
+def test_photograph_ground_shows_a_mark_like_a_pinhole_camera(orthophoto, change, off_m):
     at = move_position(HOME, *off_m)
     pose = replace(LEVEL, **change)
     picture = photograph_ground(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
@@ -61,7 +61,7 @@ def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change
     assert seen >= 3
 
 
-def test_seen_from_takes_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
+def test_photograph_ground_is_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
     rng = np.random.default_rng(0)
     edge = move_position(HOME, 300, 0)
     assert photograph_ground(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None

@@ -86,7 +86,7 @@ def test_pictures_of_a_usual_delay_are_used_and_claims_are_met(path, hidden_s):
 
 
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT, HOVER])
-def test_a_local_camera_keeps_its_times_and_claims(path):
+def test_age_watch_keeps_times_and_uncertainty_of_a_local_camera(path):
     air = LateAir(delay_sd_s=FRAME_TIME_SD_S, **path).fly(60)
     assert air.refused == []
     assert air.off_s == pytest.approx(0.0, abs=1e-9)
@@ -94,7 +94,7 @@ def test_a_local_camera_keeps_its_times_and_claims(path):
 
 
 @pytest.mark.parametrize(("hidden_s", "within_s"), [(1.0, 0.4), (3.0, 0.3)])
-def test_a_delay_is_found_in_turns_and_taken_out(hidden_s, within_s):
+def test_age_watch_finds_a_delay_in_turns_and_corrects_it(hidden_s, within_s):
     air = LateAir(hidden_s=hidden_s, **TIGHT_CIRCLE).fly(60)
     assert abs(air.off_s) < within_s
     assert abs(air.off_s) < 3 * air.t_sd_s
@@ -103,7 +103,7 @@ def test_a_delay_is_found_in_turns_and_taken_out(hidden_s, within_s):
 
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT])
 @pytest.mark.parametrize("delay_sd_s", [FRAME_TIME_SD_S, HIDDEN_DELAY_SD_S])
-def test_pictures_that_are_suddenly_late_are_refused_until_they_are_as_before(path, delay_sd_s):
+def test_age_watch_refuses_suddenly_late_images_until_the_delay_is_as_before(path, delay_sd_s):
     air = LateAir(delay_sd_s=delay_sd_s, **path)
     air.hidden_s, from_s = 3.0, air.t_s
     air.fly(1)
@@ -119,7 +119,7 @@ def test_pictures_that_are_suddenly_late_are_refused_until_they_are_as_before(pa
 
 
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT])
-def test_a_frozen_picture_is_of_unknown_age(path):
+def test_age_watch_treats_a_frozen_image_as_of_unknown_age(path):
     air = LateAir(**path)
     for _ in range(10):
         air.fly(1)
@@ -127,7 +127,7 @@ def test_a_frozen_picture_is_of_unknown_age(path):
     assert len(air.refused) >= 8, "a delay of one second may be usual"
 
 
-def test_check_age_reports_once_and_leaves_out_the_match(tmp_path, clock, link):
+def test_check_age_reports_once_and_skips_the_match(tmp_path, clock, link):
     log = FlightLog(tmp_path / "log", clock=clock)
     ages = [(False, 0.0), (True, 0.0), (True, 0.0), (False, 0.6)]
     navigator, events, summaries = Navigator(1.0, 1.0), [], []

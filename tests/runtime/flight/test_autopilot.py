@@ -15,7 +15,7 @@ def fixes(lines):
     return [fix and (fix["sent"], fix["why"]) for fix in (line["fix"] for line in of_kind(lines, "query"))]
 
 
-def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last(make_flight, clock, link):
+def test_query_line_has_its_fix_and_the_last_answer(make_flight, clock, link):
     lines = make_flight().fly(FakeSource(pictures(3), clock))
     assert fixes(lines) == [(True, None)] * 3
     first = of_kind(lines, "query")[0]["fix"]
@@ -24,7 +24,7 @@ def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last
     assert link.stats().fixes_sent == 3
 
 
-def test_every_answer_has_its_own_line_before_the_next_query(make_flight, clock, link, statuses):
+def test_answer_line_precedes_the_next_query(make_flight, clock, link, statuses):
     link.answer = "FAILED"
     lines = make_flight().fly(FakeSource(pictures(4), clock))
     assert [line["kind"] for line in lines if line["kind"] in ("query", "answer")] == ["query", "answer"] * 4
@@ -34,15 +34,13 @@ def test_every_answer_has_its_own_line_before_the_next_query(make_flight, clock,
     assert "3 fixes sent, 0 accepted, 3 refused (GPS in use)" in statuses[-1]
 
 
-def test_what_was_never_sent_waits_for_no_answer(make_flight, clock):
+def test_fix_not_sent_expects_no_answer(make_flight, clock):
     lines = make_flight(**{"mavlink.send_fixes": False}).fly(FakeSource(pictures(3), clock))
     assert len(of_kind(lines, "query")) == 3
     assert not of_kind(lines, "answer")
 
 
-def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and_the_status(
-    make_flight, clock, link, statuses
-):
+def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, statuses):
     flown = make_flight()
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
@@ -53,19 +51,19 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
     assert "2 too late" in statuses[-1]
 
 
-def test_without_a_link_the_line_says_so(recording, tmp_path, clock):
+def test_fix_without_a_link_is_reported(recording, tmp_path, clock):
     lines = flight_over(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
     assert fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
     assert not of_kind(lines, "answer")
 
 
-def test_what_is_not_accepted_has_no_fix_to_speak_of(make_flight, clock, link):
+def test_refused_match_has_no_fix(make_flight, clock, link):
     lines = make_flight().fly(FakeSource(pictures(2, first=100), clock))
     assert fixes(lines) == [None, None]
     assert link.stats().fixes_sent == 0
 
 
-def test_the_cost_of_every_query_is_told(make_flight, clock, link):
+def test_query_cost_is_sent_for_each_query(make_flight, clock, link):
     flown = make_flight(board="rpi-4b")
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(0.1, 2.0), encode(*seen))[1]
@@ -76,7 +74,7 @@ def test_the_cost_of_every_query_is_told(make_flight, clock, link):
 
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
-def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(make_flight, clock, link, technique):
+def test_confidence_of_an_accepted_match_is_sent_if_known(make_flight, clock, link, technique):
     lines = make_flight(technique).fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
     queries = of_kind(lines, "query")
     assert [line["accepted"] for line in queries] == [True, True, False]
@@ -91,7 +89,7 @@ def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(make_flight, cl
 
 
 @pytest.mark.slow
-def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(make_flight, clock, link):
+def test_camera_lost_is_announced_and_critical_until_it_is_back(make_flight, clock, link):
     health = []
     source = FakeSource(pictures(5), clock, work=lambda: (health.append(link.health.name), turn())[0])
 
@@ -104,14 +102,14 @@ def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(make_fli
     assert [line["condition"] for line in of_kind(lines, "source")] == ["LOST", "RUNNING"]
 
 
-def test_a_listener_that_fails_does_not_end_the_flight(make_flight, clock, link, caplog):
+def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, caplog):
     link.send_fix = lambda fix: 1 / 0
     lines = make_flight().fly(FakeSource(pictures(2), clock))
     assert len(of_kind(lines, "query")) == 2
     assert sum("could not be informed" in record.message for record in caplog.records) == 2
 
 
-def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_them(make_flight, clock, link):
+def test_blank_images_are_reported_once_after_ten_and_so_is_the_ground_again(make_flight, clock, link):
     health, ground = [], pictures(1, first=1)
     seen = [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3]
     lines = make_flight().fly(FakeSource(seen, clock, work=lambda: health.append(link.health)))

@@ -12,7 +12,7 @@ def queries(lines):
     return [line["query"] for line in of_kind(lines, "query")]
 
 
-def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_picture(make_flight, clock, link):
+def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_flight, clock, link):
     answers, health = [], []
     wishes = {2: UserCommand.PAUSE, 5: UserCommand.RESUME}
 
@@ -33,7 +33,7 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
     assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: resumed by command")]
 
 
-def test_a_recording_waits_while_paused(make_flight, clock, link):
+def test_pause_halts_a_recording(make_flight, clock, link):
     flown = make_flight()
     source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(UserCommand.PAUSE))
     clock.at(30.0, lambda: link.wish(UserCommand.RESUME))
@@ -44,7 +44,7 @@ def test_a_recording_waits_while_paused(make_flight, clock, link):
     assert clock.now_s - started_s == pytest.approx(60.0, abs=0.5)
 
 
-def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(make_flight, clock, link, monkeypatch):
+def test_pause_feeds_the_watchdog_and_shows_in_the_status(make_flight, clock, link, monkeypatch):
     told = []
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
     monkeypatch.delenv("WATCHDOG_PID", raising=False)

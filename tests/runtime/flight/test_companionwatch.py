@@ -34,7 +34,7 @@ def watch(notifier, link):
     return watched
 
 
-def test_take_reports_a_problem_when_it_begins_and_when_it_is_over(watch):
+def test_companion_watch_reports_a_problem_at_its_start_and_end(watch):
     assert watch([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
         (5, Severity.WARNING, "edgevpr: companion under-voltage: check 5 V supply"),
         (134, Severity.INFO, "edgevpr: companion supply is back to normal"),
@@ -42,19 +42,19 @@ def test_take_reports_a_problem_when_it_begins_and_when_it_is_over(watch):
 
 
 @pytest.mark.parametrize("apart", [2, 7, 29, 31, 45])
-def test_take_reports_a_problem_that_blinks_at_most_once_in_30_seconds(watch, apart):
+def test_companion_watch_reports_an_intermittent_problem_at_most_once_in_30_seconds(watch, apart):
     found = watch(([LOW] + [FINE] * (apart - 1)) * (600 // apart))
     times = [time for time, *_ in found]
     assert all(later - earlier >= 30 for earlier, later in pairwise(times))
     assert len(found) == 1 or apart > 30
 
 
-def test_take_reports_nothing_of_a_value_that_is_unknown(watch):
+def test_companion_watch_ignores_an_unknown_value(watch):
     assert watch([UNKNOWN] * 100) == []
     assert [severity for _, severity, _ in watch([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
 
 
-def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_flight, clock, link, tree, caplog):
+def test_companion_watch_reports_under_voltage_everywhere(make_flight, clock, link, tree, caplog):
     root = tree({(firmware := "sys/devices/platform/soc/soc:firmware/get_throttled"): "0\n"})
     flight, statuses = make_flight("hog"), []
 

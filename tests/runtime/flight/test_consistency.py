@@ -32,7 +32,7 @@ def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
     return of_kind(lines, "query"), link
 
 
-def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(recording, tmp_path):
+def test_gate_fix_logs_and_announces_a_held_fix_once_in_flight(recording, tmp_path):
     queries, link = fly(recording, tmp_path, (0, 20, 2, 3, 4))
     assert all(line["accepted"] for line in queries), "held back or not, the match stays accepted"
     assert [line["fix"]["sent"] for line in queries] == [False, False, False, True, True]
@@ -98,7 +98,7 @@ def verdict_of(result):
         ([(0, second, second, {"error_deg": 140}) for second in range(3)], False, "..."),
     ],
 )
-def test_consistency_believes_what_others_prove_within_limits(fixes, is_tracked, verdicts):
+def test_consistency_accepts_a_fix_that_others_confirm_within_limits(fixes, is_tracked, verdicts):
     judge = Consistency()
     results = [
         judge.judge(compared(*each[:3], **dict(*each[3:])), has_gps=False, is_tracked=is_tracked) for each in fixes
@@ -106,7 +106,7 @@ def test_consistency_believes_what_others_prove_within_limits(fixes, is_tracked,
     assert "".join(map(verdict_of, results)) == verdicts
 
 
-def test_consistency_believes_no_fix_against_gps():
+def test_consistency_rejects_any_fix_against_gps():
     judge = Consistency()
     for second in range(6):
         reason = judge.judge(compared(500.0, second, second), has_gps=True, is_tracked=False).reason
@@ -128,7 +128,7 @@ def test_consistency_is_in_doubt_until_another_should_have_agreed(is_tracked, go
 
 
 @pytest.mark.parametrize(("before_deg", "error_deg"), [(100.0, 0.0), (0.0, 100.0)])
-def test_consistency_reports_by_how_much_a_picture_is_turned(before_deg, error_deg):
+def test_consistency_reports_the_rotation_of_an_image(before_deg, error_deg):
     judge = Consistency()
     judge.judge(compared(0.0, 0, error_deg=before_deg), has_gps=True, is_tracked=False)
     for has_gps in (True, False):

@@ -29,9 +29,7 @@ def mapped(line):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [1, 2, 3, 7, PLACES])
-def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it_may_be_seen(
-    place_map, tmp_path, place
-):
+def test_damaged_fine_part_costs_one_query_and_then_only_queries_that_may_show_it(place_map, tmp_path, place):
     damage = partial(write_sql, place_map, f"UPDATE places SET fine = x'00' WHERE place_id = {place}")
     queries, lines, flight = fly_acts(place_map, tmp_path / "log", [nothing, damage, *[nothing] * 10])
     assert len(queries) == 12
@@ -55,9 +53,7 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
 
 @pytest.mark.slow
 @pytest.mark.parametrize("column", COLUMNS)
-def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_is_not_in_the_map(
-    place_map, tmp_path, column
-):
+def test_damaged_columns_never_end_the_flight_or_send_a_position_outside_the_map(place_map, tmp_path, column):
     """Each kind of damage at every place at once, so that candidates and the best place have it."""
 
     def damage(value):
@@ -78,9 +74,7 @@ def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_i
             assert mapped(line)
 
 
-def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
-    place_map, tmp_path, clock, link, caplog
-):
+def test_failures_are_critical_and_reported_once_after_ten_until_recovery(place_map, tmp_path, clock, link, caplog):
     health, whole = [], place_map.read_bytes()
 
     damage = partial(write_sql, place_map, "UPDATE places SET fine = x'00'")

@@ -29,7 +29,7 @@ def fly_blind(min_accuracy_m, gyro_sd, show_tilt):
 
 @pytest.mark.parametrize("min_accuracy_m", [0.1, 0.5, 1.0, 2.0, 5.0, 20.0])
 @pytest.mark.parametrize(("gyro_sd", "show_tilt"), [(GOOD, True), (GOOD, False), (AS_SIMULATED, True)])
-def test_loop_holds_for_every_accuracy_that_is_asked_for(min_accuracy_m, gyro_sd, show_tilt):
+def test_loop_is_stable_for_each_claimed_accuracy(min_accuracy_m, gyro_sd, show_tilt):
     away_m = fly_blind(min_accuracy_m, gyro_sd, show_tilt)
     room_m = max(3.0, min_accuracy_m) * (2.0 if gyro_sd == AS_SIMULATED else 1.0)
     assert np.median(away_m) < 1.2 * room_m
@@ -37,7 +37,7 @@ def test_loop_holds_for_every_accuracy_that_is_asked_for(min_accuracy_m, gyro_sd
 
 
 @pytest.mark.parametrize("min_accuracy_m", [0.1, 1.0])
-def test_claim_as_good_as_the_matches_would_not_hold_where_no_picture_shows_the_tilt(min_accuracy_m, monkeypatch):
+def test_claims_as_accurate_as_the_matches_fail_without_tilt_measurements(min_accuracy_m, monkeypatch):
     """And with gyros that are taken to be as good as they are. This is how a PX4 was lost within a minute."""
     monkeypatch.setattr(navigator, "CORRELATION_FACTOR", 1.0)
     monkeypatch.setattr(navigator, "INERTIAL_PX4", replace(drift.INERTIAL, acceleration_noise=0.02))
@@ -45,6 +45,6 @@ def test_claim_as_good_as_the_matches_would_not_hold_where_no_picture_shows_the_
 
 
 @pytest.mark.parametrize("min_accuracy_m", [0.1, 1.0])
-def test_loop_is_tight_where_pictures_show_the_tilt(min_accuracy_m):
+def test_loop_is_tight_if_images_show_the_tilt(min_accuracy_m):
     away_m = {shows: fly_blind(min_accuracy_m, AS_SIMULATED, shows) for shows in (True, False)}
     assert np.median(away_m[True]) < 0.8 * np.median(away_m[False])

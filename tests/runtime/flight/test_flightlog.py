@@ -56,7 +56,7 @@ def kinds(path: Path) -> list[str]:
     return [json.loads(line)["kind"] for line in path.read_bytes().splitlines()]
 
 
-def test_a_match_is_written_as_it_is_with_nan_as_null(path):
+def test_write_logs_a_match_with_nan_as_null(path):
     match = Recognition(
         frame=None,
         accepted=True,
@@ -76,7 +76,7 @@ def test_a_match_is_written_as_it_is_with_nan_as_null(path):
     assert record["event"]["cost"]["marginal_mah"] is None
 
 
-def test_the_first_line_says_who_flies_with_what(path):
+def test_create_logs_program_configuration_and_map_in_the_first_line(path):
     spec = TechniqueSpec(name="cohog", parameters={"image": 512}, coarse=PartSpec((4,), "<f4"), model_sha256="ab")
     config = load_config(None, {"map": "valley.gpkg"})
     with FlightLog(path) as log, PlaceMap.create(path.with_name("valley.gpkg"), spec) as place_map:
@@ -96,7 +96,7 @@ def test_the_first_line_says_who_flies_with_what(path):
     assert record["version"]
 
 
-def test_the_disk_is_synced_at_most_once_a_second_and_at_the_end(path, syncs):
+def test_flight_log_syncs_at_most_once_a_second_and_at_the_end(path, syncs):
     clock = FakeClock()
     log = FlightLog(path, clock)
     for _ in range(9):  # two seconds at four lines a second
@@ -112,7 +112,7 @@ def test_the_disk_is_synced_at_most_once_a_second_and_at_the_end(path, syncs):
     assert len(syncs) == 5
 
 
-def test_a_sync_that_fails_between_lines_is_trouble_and_no_exception(path, monkeypatch, caplog):
+def test_sync_if_due_records_an_error_between_lines_without_raising(path, monkeypatch, caplog):
     clock = FakeClock()
     with FlightLog(path, clock) as log:
         log.write("first")
@@ -126,14 +126,14 @@ def test_a_sync_that_fails_between_lines_is_trouble_and_no_exception(path, monke
     assert kinds(path) == ["first", "second", "gap", "third"]
 
 
-def test_reading_leaves_out_a_last_line_cut_at_any_byte_and_what_is_no_record(path):
+def test_read_log_skips_a_truncated_last_line_and_invalid_records(path):
     whole, last = b'{"kind": "a"}\n\n[1]\n\0\0\0\0\n\xff\xfe\n{"kind": "b"}\n', b'{"kind": "c", "x": 1}'
     for cut in range(len(last)):
         path.write_bytes(whole + last[:cut])
         assert list(read_log(path)) == [{"kind": "a"}, {"kind": "b"}]
 
 
-def test_a_disk_that_has_room_again_is_written_again_without_half_a_line(path, caplog):
+def test_write_resumes_without_a_partial_line_once_the_disk_has_space(path, caplog):
     caplog.set_level(logging.INFO)
     log = FlightLog(path)
     log.write("before")
@@ -154,7 +154,7 @@ def test_a_disk_that_has_room_again_is_written_again_without_half_a_line(path, c
 
 
 @pytest.mark.parametrize("umask", [0, 0o022, 0o077])
-def test_a_log_is_for_its_owner_and_group_whatever_the_umask(umask, path):
+def test_flight_log_is_readable_by_owner_and_group_under_any_umask(umask, path):
     before = os.umask(umask)
     try:
         FlightLog(path).close()
@@ -173,7 +173,7 @@ def flown(log, clock, *names):
 
 
 @pytest.mark.parametrize("taken_away", [Path.unlink, lambda path: path.rename(path.with_suffix(".1"))])
-def test_a_log_that_is_deleted_or_moved_in_flight_goes_on_in_a_new_file(path, caplog, taken_away):
+def test_flight_log_continues_in_a_new_file_if_deleted_or_moved(path, caplog, taken_away):
     clock = FakeClock()
     with FlightLog(path, clock) as log:
         flown(log, clock, "start", "a", "b")
@@ -184,7 +184,7 @@ def test_a_log_that_is_deleted_or_moved_in_flight_goes_on_in_a_new_file(path, ca
     assert select_last_flight(path).missing
 
 
-def test_the_password_of_a_camera_stands_in_no_line(path):
+def test_write_hides_the_password_of_the_camera(path):
     config = load_config(None, {"source.uri": "rtsp://pilot:secret@10.0.0.2/cam", "log.path": str(path)})
     spec = TechniqueSpec(name="cohog", parameters={}, coarse=PartSpec((4,), "<f4"))
     with FlightLog(path) as log, PlaceMap.create(path.with_name("m.gpkg"), spec) as place_map:
@@ -199,7 +199,7 @@ def test_the_password_of_a_camera_stands_in_no_line(path):
 @pytest.mark.parametrize(
     ("name", "said"), [("", "cannot"), ("absent/flight.jsonl", "cannot"), ("file/x.jsonl", "cannot"), ("pipe", "pipe")]
 )
-def test_a_path_that_is_no_log_is_one_sentence_and_not_waited_for(tmp_path, name, said):
+def test_flight_log_refuses_a_path_that_is_not_a_log_at_once(tmp_path, name, said):
     (tmp_path / "file").touch()
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(EdgevprError, match=said) as refused:
@@ -226,7 +226,7 @@ def parts(path: Path) -> list[Path]:
     return [*list_numbered(path), path]
 
 
-def test_a_log_that_is_full_goes_on_in_a_new_file_and_each_can_be_read_alone(path, caplog):
+def test_flight_log_continues_in_a_new_readable_file_when_full(path, caplog):
     written(path, 120)
     assert [each.name for each in parts(path)] == ["flight-0001.jsonl", "flight-0002.jsonl", "flight.jsonl"]
     assert [n for part in parts(path) for n in numbers(part)] == list(range(120))
@@ -236,7 +236,7 @@ def test_a_log_that_is_full_goes_on_in_a_new_file_and_each_can_be_read_alone(pat
     assert not caplog.records
 
 
-def test_a_flight_and_those_before_it_stay_within_the_limit_and_the_oldest_go_first(path):
+def test_flight_log_deletes_the_oldest_files_beyond_the_limit(path):
     for flight in range(10):
         written(path, 100, 100 * flight)
         assert sum(part.stat().st_size for part in list_numbered(path)) <= 3e6 * PART_MB, "the newest may grow"
@@ -252,7 +252,7 @@ def refusing(*_: object, **more: object) -> None:
     raise OSError(30, "Read-only file system")
 
 
-def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, monkeypatch):
+def test_flight_log_continues_in_a_file_that_cannot_be_renamed_and_reports_it_once(path, caplog, monkeypatch):
     monkeypatch.setattr(os, "replace", refusing)
     written(path, 100)
     log = written(path, 100, 100)
@@ -267,7 +267,7 @@ def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, 
     assert [line["n"] for line in select_last_flight(path) if line["kind"] == "query"] == list(range(100, 200))
 
 
-def test_a_log_that_another_flight_writes_is_refused_and_a_service_waits_for_it(path):
+def test_flight_log_refuses_a_log_in_use_and_a_service_waits_for_it(path):
     with FlightLog(path) as first:
         first.write("start", name="a")
         with pytest.raises(EdgevprError, match="another edgevpr process writes to it"):
@@ -281,7 +281,7 @@ def test_a_log_that_another_flight_writes_is_refused_and_a_service_waits_for_it(
     assert [kinds(part) for part in parts(path)] == [["start", "query"], ["gap", "query"]]
 
 
-def test_a_start_that_was_lost_is_made_up_for(path):
+def test_flight_log_repeats_a_lost_start_line(path):
     with FlightLog(path) as log:
         with no_file_larger_than(10):
             log.write("start", version="1")
@@ -292,7 +292,7 @@ def test_a_start_that_was_lost_is_made_up_for(path):
 
 
 @pytest.mark.slow
-def test_kill_9_at_any_time_loses_no_line_and_no_file(path):
+def test_flight_log_loses_no_line_and_no_file_at_kill_9(path):
     script = "import sys; from itertools import count; from edgevpr.runtime.flight.flightlog import FlightLog\n"
     script += f"log = FlightLog(sys.argv[1], max_mb={4 * PART_MB})\nlog.write('start')\n"
     script += "for n in count(int(sys.argv[2])):\n    log.write('query', n=n); print(n, flush=True)"
@@ -311,7 +311,7 @@ def test_kill_9_at_any_time_loses_no_line_and_no_file(path):
         begin = kept[-1] + 1
 
 
-def test_a_service_waits_for_the_medium_of_its_log(tmp_path, caplog):
+def test_flight_log_of_a_service_waits_for_its_storage(tmp_path, caplog):
     path = tmp_path / "card" / "flight.jsonl"
     log = FlightLog(path, wait=True)
     assert str(path) in log.fault

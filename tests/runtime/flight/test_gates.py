@@ -109,7 +109,7 @@ def test_position_is_known_well_enough_within_limits(channel, known, is_known):
 
 
 @pytest.mark.parametrize(("accuracy_m", "claimed_m"), [(0.5, 1.0), (2.0, 2.0), (None, None)])
-def test_accuracy_is_never_better_than_the_error_that_all_fixes_share(accuracy_m, claimed_m):
+def test_accuracy_is_never_better_than_the_common_error_of_all_fixes(accuracy_m, claimed_m):
     assert navigate(accuracy_m=accuracy_m).accuracy_m(NOW_S) == claimed_m
 
 
@@ -141,7 +141,7 @@ def test_output_is_chosen_by_channel_and_receiver(channel, reports, before, outp
     assert navigator.output is output
 
 
-def test_no_position_is_sent_that_is_unknown_contradicted_or_withdrawn():
+def test_navigator_sends_no_unknown_contradicted_or_withdrawn_position():
     unheard, unknown = navigate(Channel.GPS_INPUT, is_heard=False), navigate(Channel.GPS_INPUT, accuracy_m=None)
     for navigator in (unheard, unknown):
         assert (navigator.estimate_state(NOW_S), navigator.output) == (None, Output.STARTING)
@@ -157,7 +157,7 @@ def test_no_position_is_sent_that_is_unknown_contradicted_or_withdrawn():
     assert navigate(Channel.GPS_INPUT, how={"is_muted": True}).estimate_state(NOW_S) is None
 
 
-def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
+def test_continuous_position_claims_the_accuracy_of_fifty_correlated_ones():
     navigator = navigate(Channel.GPS_INPUT, reports={"sink_m_s": 0.7}, map_sd_m=1.0)
     navigator.handle_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
     state = navigator.estimate_state(NOW_S)
@@ -175,7 +175,7 @@ def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
 @pytest.mark.parametrize(
     ("sd_m", "alt_m", "expected_m"), [(1.0, 250.0, 250.0), (1.0, None, 300.0), (20.0, 250.0, 300.0)]
 )
-def test_altitude_of_a_reserve_is_that_of_the_receiver(sd_m, alt_m, expected_m):
+def test_fallback_position_has_the_altitude_of_the_receiver(sd_m, alt_m, expected_m):
     state = navigate(Channel.GPS_INPUT, reports=receiver(sd_m, alt_m=alt_m)).estimate_state(NOW_S)
     assert (state.alt_m, state.is_fallback) == (expected_m, sd_m == 1.0)
 
@@ -190,7 +190,7 @@ def test_altitude_of_a_reserve_is_that_of_the_receiver(sd_m, alt_m, expected_m):
         (Channel.SENSOR, {}, 5.1, LIKE_ONE),
     ],
 )
-def test_px4_is_told_plain_errors_while_pictures_show_its_attitude(channel, how, shown_ago_s, factor):
+def test_px4_gets_uninflated_errors_while_images_show_its_attitude(channel, how, shown_ago_s, factor):
     navigator = navigate(channel, how=how)
     if shown_ago_s:
         lean = AttitudeError((0.01, 0.0), 0.01)
@@ -224,7 +224,7 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
     assert motions == [(NOW_S, (1.0, 2.0), None, rests)]
 
 
-def test_frame_claims_an_error_of_the_height_that_pictures_show():
+def test_frame_claims_a_height_error_shown_by_images():
     navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
     navigator.handle_frame(matched())
     navigator.correct_height(1.2, 0.1)
@@ -258,7 +258,7 @@ TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(Reas
         (CONTINUOUS, {}, {}, 0.0, ReasonCode.CONTINUOUS),
     ],
 )
-def test_match_is_sent_only_where_it_may_be(channel, reports, event, contradicts_m, code):
+def test_match_is_sent_only_if_allowed(channel, reports, event, contradicts_m, code):
     navigator = navigate(channel, reports=reports)
     navigator._navigation.contradicts_m = contradicts_m
     advice = navigator.advise(matched(**event), NOW_S)
@@ -279,7 +279,7 @@ def test_accuracy_of_a_fix_contains_the_error_of_its_time():
 
 
 @pytest.mark.parametrize("is_heard", [True, False])
-def test_autopilot_that_has_just_been_heard_is_sent_nothing_for_five_seconds(is_heard):
+def test_autopilot_gets_nothing_in_its_first_five_seconds(is_heard):
     navigator = navigate(is_heard=is_heard, reports={"t_received_s": NOW_S - 5.0})
     if not is_heard:
         navigator.handle_autopilot(NOW_S - 5.0)
@@ -287,7 +287,7 @@ def test_autopilot_that_has_just_been_heard_is_sent_nothing_for_five_seconds(is_
     assert navigator.advise(matched(), NOW_S + 0.1).fix
 
 
-def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
+def test_fix_is_sent_if_it_improves_the_autopilots_position():
     reports = {"velocity_m_s": (10.0, -4.0), "t_received_s": NOW_S - 0.5}
     same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(matched(), NOW_S)
     assert same.why.code is ReasonCode.NOT_BETTER
@@ -301,7 +301,7 @@ def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
         assert fix.t_frame_s == NOW_S
 
 
-def test_no_fix_is_sent_beside_gps_or_where_the_map_contradicts_it():
+def test_navigator_sends_no_fix_with_gps_or_while_the_map_contradicts_it():
     beside, doubted, unknown = (navigate(off_m=(10.0, 0.0), reports=said) for said in (GPS, {}, {}))
     assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_GPS
     beside.trust_gps(False)
@@ -326,13 +326,13 @@ def test_no_fix_is_sent_beside_gps_or_where_the_map_contradicts_it():
     ],
     ids=str,
 )
-def test_fix_between_matches_is_sent_to_an_autopilot_that_needs_it_only(change):
+def test_fix_between_matches_is_sent_only_to_an_autopilot_that_needs_it(change):
     off = {"off_m": (10.0, 0.0)}
     assert navigate(**off).make_interim_fix(NOW_S)
     assert navigate(**off | change).make_interim_fix(NOW_S) is None
 
 
-def test_no_fix_is_sent_between_matches_that_contradict_or_of_unknown_age():
+def test_navigator_sends_no_interim_fix_if_matches_contradict_or_age_is_unknown():
     navigator = navigate(off_m=(10.0, 0.0))
     navigator.age.is_unknown = True
     assert navigator.make_interim_fix(NOW_S) is None
@@ -341,7 +341,7 @@ def test_no_fix_is_sent_between_matches_that_contradict_or_of_unknown_age():
     assert navigator.make_interim_fix(NOW_S) is None
 
 
-def test_navigation_begins_anew_where_the_path_errs_otherwise():
+def test_navigation_resets_if_the_error_of_the_path_changes():
     navigator, seen = Navigator(1.0, 1.0), []
     for channel in (Channel.NONE, Channel.COMMAND, Channel.SENSOR, Channel.VISION, Channel.GPS_INPUT, Channel.ODOMETRY):
         navigator.handle_channel(channel)

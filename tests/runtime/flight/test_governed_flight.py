@@ -36,7 +36,7 @@ def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
     return of_kind(lines, "governor"), lines, flight.link.texts(), flight
 
 
-def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_path, statuses, caplog):
+def test_governor_change_is_logged_and_announced_once_and_reverted(recording, tmp_path, statuses, caplog):
     script = [BUSY] * 2 + [CALM] * 3
     changes, _, texts, _ = governed(recording / "cohog.gpkg", tmp_path / "log", script, 8, **{"source.rate_hz": 60.0})
     down, back = changes
@@ -50,7 +50,7 @@ def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_pat
     assert "held to" not in statuses[-1]
 
 
-def test_fewer_candidates_are_compared_before_the_rate_is_lowered(recording, tmp_path, monkeypatch):
+def test_governor_lowers_candidates_before_the_rate_in_flight(recording, tmp_path, monkeypatch):
     compared = []
     step = Recogniser.step
     monkeypatch.setattr(

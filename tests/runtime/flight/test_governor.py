@@ -49,7 +49,7 @@ def load(setting):
     return setting.rate_hz / 2 * (1 + setting.candidates / 40) / 2
 
 
-def test_the_candidates_are_lowered_first_then_the_rate():
+def test_governor_lowers_candidates_before_the_rate():
     settings = list_settings(Setting(1.0, 40, "float"), keeps_rate=False, fewer=(20,))
     rates_hz = 1.0, 0.5, 0.25, 0.125
     assert settings == (Setting(1.0, 40, "float"), *(Setting(rate_hz, 20, "float") for rate_hz in rates_hz))
@@ -62,7 +62,7 @@ def test_the_candidates_are_lowered_first_then_the_rate():
     assert changes[-1] == Change(settings[-1], settings[-1], taken)
 
 
-def test_it_goes_back_in_the_opposite_order():
+def test_governor_reverts_in_the_opposite_order():
     flight = Flight(lambda setting, now_s: BUSY if now_s <= 60 else CALM)
     flight.fly(60)
     assert flight.governor.setting == Setting(0.25, 20)
@@ -71,7 +71,7 @@ def test_it_goes_back_in_the_opposite_order():
     assert flight.governor.setting == ASKED
 
 
-def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidates():
+def test_list_settings_keeps_the_rate_of_a_sequence_and_needs_two_stages_for_candidates():
     assert list_settings(ASKED, keeps_rate=True, fewer=(20,)) == (ASKED, Setting(2.0, 20))
     assert list_settings(ASKED, keeps_rate=True) == (ASKED,)
     assert list_settings(Setting(2.0, 15), keeps_rate=True, fewer=(20,)) == (Setting(2.0, 15),)
@@ -80,7 +80,7 @@ def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidate
     assert [each.rate_hz for each in list_settings(ASKED, keeps_rate=False)] == [2.0, 1.0, 0.5, 0.25]
 
 
-def test_what_it_cannot_help_is_said_once():
+def test_governor_reports_once_what_it_cannot_change():
     flight = Flight(lambda setting, now_s: BUSY, settings=(ASKED,))
     (change,) = flight.fly(600)
     assert change.before == change.after == ASKED
@@ -91,7 +91,7 @@ def test_what_it_cannot_help_is_said_once():
 
 
 @pytest.mark.parametrize("full_c", [81, 84, 90, 100])
-def test_a_board_that_heats_slowly_is_held_below_its_limit(full_c):
+def test_governor_holds_a_slowly_heating_board_below_its_limit(full_c):
     """A first-order board: 90 s to react, `full_c` degrees at the rate asked, 40 idle."""
     hottest_c, temperature_c = [], [40.0]
 
@@ -119,7 +119,7 @@ def wait_s(flight, trouble_s):
     return flight.now_s - until_s
 
 
-def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_for_long():
+def test_governor_doubles_its_wait_after_failures_and_resets_it_after_a_long_success():
     flight = Flight(lambda setting, now_s: CALM, settings=list_settings(ASKED, keeps_rate=False))
     assert [wait_s(flight, 5) for _ in range(3)] == [7, 13, 25]
     assert wait_s(flight, 13) == 3 * 49, "one failure, however many steps it takes"
@@ -127,7 +127,7 @@ def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_fo
     assert wait_s(flight, 5) == 7
 
 
-def test_without_a_temperature_a_board_that_throttles_is_believed():
+def test_governor_trusts_throttling_without_a_temperature():
     flight = Flight(lambda setting, now_s: measured())
     assert flight.fly(600) == []
     flight.reading = lambda setting, now_s: measured(throttled=True)
@@ -135,7 +135,7 @@ def test_without_a_temperature_a_board_that_throttles_is_believed():
     assert (change.after.rate_hz, change.why.code) == (1.0, ReasonCode.BOARD_THROTTLED)
 
 
-def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are_gone():
+def test_governor_lowers_the_rate_while_other_programs_delay_queries():
     def reading(setting, now_s):
         takes = 0.7 * load(setting)  # of the time; another program doubles it until 100 s
         return measured(cpu_share=0.2, late_share=min(1.0, 2 * takes) if now_s < 100 else takes)
@@ -147,7 +147,7 @@ def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are
     assert [change.after for change in flight.fly(60)] == [Setting(2.0, 20), ASKED]
 
 
-def test_memory_that_runs_short_is_said_once():
+def test_governor_reports_low_memory_once():
     flight = Flight(lambda setting, now_s: measured(rss_mb=500.0))
     (change,) = flight.fly(600)
     assert change.before == change.after == ASKED

@@ -60,7 +60,7 @@ def test_match_contradicts_gps_beyond_four_standard_deviations(sd_m, map_sd_m, l
     ("sd_m", "before_m", "limit_m"),
     [(EXACT, [4] * 10, 11.0), (EXACT, [0] * 9, 15.0), (USUAL, [0] * 10, 17.5), (EXACT, [0] * 60 + [6] * 60, 10.81)],
 )
-def test_match_contradicts_gps_that_has_moved_beside_those_before(sd_m, before_m, limit_m):
+def test_match_contradicts_gps_that_has_moved_relative_to_earlier_matches(sd_m, before_m, limit_m):
     seconds = len(before_m)
     for beyond_m, is_wrong in ((-0.02, False), (0.02, True)):
         watched = Watched(sd_m)
@@ -102,12 +102,12 @@ def test_reset_forgets_how_matches_differed_from_gps():
         ([((100, 0)[number % 2], 2.5 * number, (number % 2,)) for number in range(9)], False),
     ],
 )
-def test_gps_is_wrong_by_matches_that_prove_it(matches, is_wrong):
+def test_gps_watch_requires_enough_matches_to_call_gps_wrong(matches, is_wrong):
     watched = Watched(USUAL)
     assert [watched.match(*match) for match in matches] == [False] * (len(matches) - 1) + [is_wrong]
 
 
-def test_gps_is_right_again_after_three_that_agree():
+def test_gps_watch_trusts_gps_again_after_three_agreeing_matches():
     watched = Watched()
     watched.matches(*[100.0] * 3)
     assert watched.matches(0.0, 0.0, begin_s=3)
@@ -120,13 +120,13 @@ def test_gps_is_right_again_after_three_that_agree():
 
 
 @pytest.mark.parametrize(("agreeing", "trusts_gps"), [(2, True), (3, False)])
-def test_gps_is_believed_against_a_map_that_has_not_agreed_with_it(agreeing, trusts_gps):
+def test_gps_watch_trusts_gps_over_a_map_that_never_agreed(agreeing, trusts_gps):
     watched = Watched()
     assert watched.matches(*[0.0] * agreeing, *[100.0] * 3)
     assert watched.navigator.trusts_gps() is trusts_gps
 
 
-def test_gps_is_reported_again_when_its_distance_has_doubled():
+def test_gps_watch_reports_again_once_the_distance_has_doubled():
     watched = Watched()
     watched.matches(100.0, 100.0, 100.0, 199.0, 201.0, 202.0, *[0.0] * 25)
     says = [(Severity.WARNING, f"edgevpr: GPS is {off_m} m from the map's position") for off_m in (100, 201)]
@@ -144,14 +144,14 @@ def test_gps_is_reported_again_when_its_distance_has_doubled():
         (None, 40.0, True),
     ],
 )
-def test_match_may_be_off_gps_by_the_attitude_error_that_it_shows(lean, height_m, is_wrong):
+def test_match_may_differ_from_gps_by_its_attitude_error(lean, height_m, is_wrong):
     watched = Watched()
     for second in range(3):
         found = watched.match(60.0, second, (second,), lean=lean, height_m=height_m)
     assert found is is_wrong
 
 
-def test_match_is_compared_with_where_the_receiver_was():
+def test_match_is_compared_with_the_receiver_position_at_its_time():
     velocity_m_s = 25.0, 0.0
     watched, where = Watched(), offset_position(*HOME, -25.0 * (0.8 + RECEIVER_LAG_S), 0.0)
     receiver = receiver_at(where, 1.0, BEGIN_S - 0.8, velocity_m_s=(0.0, 9.0))
@@ -160,7 +160,7 @@ def test_match_is_compared_with_where_the_receiver_was():
         assert watched.distances_m()[-1] == pytest.approx(off_m, abs=0.01)
 
 
-def test_what_cannot_be_compared_is_not():
+def test_gps_watch_skips_what_cannot_be_compared():
     watched = Watched()
     for vehicle in (vehicle_at(*HOME, BEGIN_S, has_gps=False), vehicle_at(*HOME, BEGIN_S - 1.1)):
         watched.match(0.0, 0.0, (1,), vehicle=vehicle)

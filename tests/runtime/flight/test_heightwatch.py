@@ -52,7 +52,7 @@ def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
     ]
 
 
-def test_ratio_sd_is_what_the_newest_match_contradicts_the_ratio_by(watch):
+def test_ratio_sd_is_the_deviation_of_the_newest_match(watch):
     assert watch.watch.ratio_sd == 0.0
     watch.see(101, 99, 108)
     assert watch.watch.ratio_sd == 0.0, "matches scatter by as much"
@@ -90,6 +90,6 @@ def test_heightwatch_corrects_by_less_than_it_reports(watch):
         ([150] * 9, {"reported_m": None}),
     ],
 )
-def test_heightwatch_reports_nothing_without_five_matches_that_contradict(watch, heights_m, how):
+def test_height_watch_reports_only_after_five_contradicting_matches(watch, heights_m, how):
     assert watch.see(*heights_m, **how) == []
     assert watch.watch.ratio == 1.0

@@ -87,9 +87,7 @@ GLITCHES = pytest.mark.parametrize("drift_m_s", [None, 1.0, 2.0, 5.0], ids=["jum
 
 @GLITCHES
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0])
-def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of_thirty_metres(
-    watched, drift_m_s, fix_sd_m
-):
+def test_gps_watch_detects_jumps_and_drift_within_fifteen_seconds_of_thirty_metres(watched, drift_m_s, fix_sd_m):
     air = watched(fix_sd_m=fix_sd_m).fly(30)
     assert air.news == []
     glitch(air, drift_m_s)
@@ -114,7 +112,7 @@ def test_gps_watch_allows_for_the_time_of_a_frame(watched, t_sd_s, is_wrong):
 
 
 @pytest.mark.parametrize("agrees_s", [0, 30])
-def test_map_that_never_agreed_with_gps_moves_no_aircraft_after_its_loss(watched, agrees_s):
+def test_map_that_never_agreed_with_gps_is_not_used_after_gps_loss(watched, agrees_s):
     """A map whose places lie 300 m beside the true ones contradicts GPS from the first match on, a receiver that is led
     away only later."""
     air = watched().fly(agrees_s)
@@ -128,9 +126,7 @@ def test_map_that_never_agreed_with_gps_moves_no_aircraft_after_its_loss(watched
 
 
 @GLITCHES
-def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_an_autopilot_that_has_it(
-    watched, drift_m_s
-):
+def test_navigation_trusts_fixes_over_wrong_gps_but_sends_none_while_the_autopilot_uses_gps(watched, drift_m_s):
     air = watched().fly(60)
     assert air.navigator.has_gps
     glitch(air, drift_m_s)
@@ -148,7 +144,7 @@ def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_a
 
 
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0, 8.0])
-def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_receiver(fix_sd_m):
+def test_gps_watch_gives_no_false_alarm_in_thirty_minutes_of_noise(fix_sd_m):
     """Five flights, whose maps are off by what the configuration says."""
     for seed in range(5):
         rng, watch = np.random.default_rng(seed), GpsWatch(MAP_SD_M, Notifier(FlightLog(None), None), None)
@@ -169,7 +165,7 @@ def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_rece
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_receiver_that_drifts_slowly_is_found_within_fifteen_seconds_of_its_beginning(watched, seed):
+def test_gps_watch_detects_slow_drift_within_fifteen_seconds_of_its_start(watched, seed):
     """With matches as good as those of a refined map: what they and the receiver have in common cancels out."""
     air = watched(fix_sd_m=0.7, seed=seed).fly(60)
     air.drift_m_s = 1.0

@@ -58,7 +58,7 @@ def fly(place_map, log, turns, **said):
     return of_kind(lines, "query"), link
 
 
-def test_the_attitude_is_asked_for_the_frames_times(place_map, tmp_path):
+def test_flight_reads_the_attitude_at_the_frame_time(place_map, tmp_path):
     queries, link = fly(place_map, tmp_path / "f.jsonl", 1, roll_deg=0.2, pitch_deg=0.0, height_m=80.0)
     assert list(link.asked_s) == [query["t_frame_s"] for query in queries]
     assert [query["reference_image"] for query in queries if query["accepted"]] == ["0", "1", "2"]
@@ -71,9 +71,7 @@ def test_the_attitude_is_asked_for_the_frames_times(place_map, tmp_path):
 @pytest.mark.parametrize(
     ("is_live", "has_gps", "before_s"), [(True, False, 2.0), (True, True, 10.0), (False, False, 10.0)]
 )
-def test_between_rare_queries_without_gps_pictures_are_taken_for_their_strides(
-    place_map, tmp_path, is_live, has_gps, before_s
-):
+def test_flight_takes_odometry_frames_between_rare_queries_without_gps(place_map, tmp_path, is_live, has_gps, before_s):
     clock = FakeClock()
 
     def vehicle():
@@ -104,7 +102,7 @@ def surveyed(monkeypatch):
 
 
 @pytest.mark.usefixtures("surveyed")
-def test_pictures_are_levelled_by_it_as_soon_as_it_is_known(place_map, tmp_path, monkeypatch):
+def test_images_are_levelled_once_the_attitude_is_known(place_map, tmp_path, monkeypatch):
     monkeypatch.setattr(watching, "_SURVEY_INTERVAL", 2)
     monkeypatch.setattr(MapSurvey, "add_match", lambda self, event, distrusts_gps: True)
     queries, _ = fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)

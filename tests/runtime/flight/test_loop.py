@@ -22,7 +22,7 @@ def flight(make_flight):
     return partial(make_flight, "hog", **{"source.rate_hz": 0.5})
 
 
-def test_a_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
+def test_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
     flown = flight()
     slept = []
 
@@ -37,7 +37,7 @@ def test_a_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
     assert slept == [pytest.approx(0.2)]
 
 
-def test_a_stop_while_a_frame_is_recognised_breaks_it_off(flight, clock):
+def test_stop_interrupts_the_recognition_of_a_frame(flight, clock):
     flown = flight()
 
     def long(image, mask):
@@ -50,7 +50,7 @@ def test_a_stop_while_a_frame_is_recognised_breaks_it_off(flight, clock):
     flown.stop()  # and a second signal finds nothing to break off
 
 
-def test_a_stop_while_others_are_told_lets_them_finish(flight, clock):
+def test_stop_lets_observers_finish(flight, clock):
     flown = flight()
     send = flown.link.send
     flown.link.send = lambda *messages: (flown.stop(), send(*messages))
@@ -62,7 +62,7 @@ def test_a_stop_while_others_are_told_lets_them_finish(flight, clock):
     assert stop.is_requested
 
 
-def test_a_stop_before_the_flight_begins_ends_it_at_once():
+def test_stop_before_the_start_ends_the_flight_at_once():
     stop = Stop()
     with pytest.raises(StopNow), stop.interrupt_start():
         stop()
@@ -71,7 +71,7 @@ def test_a_stop_before_the_flight_begins_ends_it_at_once():
     stop()  # nothing is left to break off
 
 
-def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(flight, clock):
+def test_unreadable_frame_is_logged_and_the_next_one_recognised(flight, clock):
     flown = flight()
     pictures = [PICTURE, ImageError("1.png is truncated: copy it again."), PICTURE]
     lines = flown.fly(FakeSource(pictures, clock, is_live=False))
@@ -82,7 +82,7 @@ def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(flight
     assert (flown.end["queries"], flown.end["unusable"]) == (2, 1)
 
 
-def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
+def test_pace_takes_frames_evenly_even_after_a_late_one(clock):
     pace = Pace(2.0, clock.clock)
     assert pace.wait_s() == 0
     pace.record_frame()
@@ -99,7 +99,7 @@ def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
     assert pace.wait_s() == pytest.approx(1.0)
 
 
-def test_between_frames_that_are_far_apart_pictures_are_due_for_their_strides(clock):
+def test_pace_requests_odometry_frames_between_distant_frames(clock):
     pace, due_s = Pace(0.1, clock.clock), []
     pace.record_frame()
     for _ in range(100):
@@ -123,7 +123,7 @@ def test_frames_of_a_recording_come_by_its_steps_and_slower_as_the_rate_is_lower
     assert pace.wait_s() == pytest.approx(0.5)
 
 
-def test_a_flight_over_pictures_with_times_takes_them_at_their_times(flight, clock):
+def test_recorded_flight_follows_the_times_of_its_images(flight, clock):
     class Timed(FakeSource):
         def read(self, timeout_s):
             self.step_s = next(steps, None)
@@ -135,7 +135,7 @@ def test_a_flight_over_pictures_with_times_takes_them_at_their_times(flight, clo
     assert [each - taken[0] for each in taken] == pytest.approx([0.0, 0.5, 0.5, 7.5])
 
 
-def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
+def test_apply_recorded_rate_uses_the_most_frequent_interval():
     source = SourceConfig(rate_hz=1.0)
     assert apply_recorded_rate(source, [0.5, 0.0, 0.5, 60.0]).rate_hz == 2.0
     assert apply_recorded_rate(source, [1e-6, 1e-6]).rate_hz == 60.0
@@ -145,7 +145,7 @@ def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
 @pytest.mark.parametrize(
     ("trouble", "fed_s"), [(None, 45), ("is_lost", 100), ("is_frozen", 100), ("is_opening", 100), ("recording", 100)]
 )
-def test_the_watchdog_is_fed_while_it_is_known_why_no_query_comes(flight, clock, monkeypatch, trouble, fed_s):
+def test_watchdog_is_fed_while_the_lack_of_queries_has_a_known_reason(flight, clock, monkeypatch, trouble, fed_s):
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     fed = []

@@ -17,7 +17,7 @@ SAID = [(4, "edgevpr: map cannot be read, see the log"), (6, "edgevpr: map can b
 
 
 @pytest.mark.slow
-def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_map, tmp_path, monkeypatch):
+def test_locked_map_refuses_queries_until_it_is_free(place_map, tmp_path, monkeypatch):
     other, waits_ms = sqlite3.connect(place_map, isolation_level=None), []  # of another program
     lock = partial(other.execute, "BEGIN EXCLUSIVE")
 
@@ -39,7 +39,7 @@ def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_ma
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
 @pytest.mark.parametrize("how", ["deleted", "truncated", "emptied", "noise", "a pipe", "a folder"])
-def test_a_map_that_is_gone_refuses_and_is_used_again_when_it_is_back(recording, tmp_path, technique, how):
+def test_missing_map_refuses_queries_until_it_is_back(recording, tmp_path, technique, how):
     place_map = tmp_path / "m.gpkg"
     shutil.copy(recording / f"{technique}.gpkg", place_map)
     whole = place_map.read_bytes()
@@ -73,7 +73,7 @@ def test_a_map_that_is_gone_refuses_and_is_used_again_when_it_is_back(recording,
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
 @pytest.mark.parametrize("by", ["copying", "renaming"])
-def test_another_map_in_its_place_is_refused_and_said_once(recording, tmp_path, technique, by, caplog):
+def test_replaced_map_is_refused_and_reported_once(recording, tmp_path, technique, by, caplog):
     """The same pictures, so that every place is found; but the positions are others."""
     place_map, other = tmp_path / "m.gpkg", tmp_path / "other.gpkg"
     shutil.copy(recording / f"{technique}.gpkg", place_map)

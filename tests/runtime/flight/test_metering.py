@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 PICTURE = textured(1, 240, 320)
 
 
-def test_a_flights_charge_is_the_closed_form(make_flight, clock):
+def test_used_mah_of_a_flight_equals_the_closed_form(make_flight, clock):
     """Five minutes on a Pi 4B (2.29 W idle, 4.53 W more at full load, four cores) with stages of all lengths."""
     script, spent = random.Random(5), []
 
@@ -51,7 +51,7 @@ def test_a_flights_charge_is_the_closed_form(make_flight, clock):
     assert queries[-1]["totals"]["used_mah"] == pytest.approx(totals["used_mah"], rel=1e-6)
 
 
-def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(make_flight, clock, link):
+def test_heat_is_logged_and_announced_and_figures_of_a_throttled_board_are_marked(make_flight, clock, link):
     cool = ThermalState(temperature_c=61.0, frequency_mhz=1800.0, throttled=False, why="")
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     flight = make_flight("hog")

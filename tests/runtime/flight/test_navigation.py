@@ -58,7 +58,7 @@ class Flown(Air):
         return np.array(errors_m), np.array([state.accuracy_m for _, state in states])
 
 
-def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopilot_that_reckons():
+def test_navigation_attitude_error_in_images_moves_no_fix_of_a_dead_reckoning_autopilot():
     flown, wrong = Flown(10, fix_sd_m=0.5), np.array([0.06, 0.0])  # of the height: 3.4 degrees
 
     def look(t_s, seen_m):
@@ -73,7 +73,7 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
 
 
 @pytest.mark.parametrize("upset", [drift._GPS_LOSS_NOISE_FACTOR, 0.0])
-def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_reckon_is_allowed_for(upset, monkeypatch):
+def test_navigation_allows_for_attitude_errors_after_a_new_wind(upset, monkeypatch):
     """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
     monkeypatch.setattr(drift, "_GPS_LOSS_NOISE_FACTOR", upset)
     flown, frames = Flown(30, wind=(5.0, 0.0), fix_sd_m=0.5), []
@@ -93,7 +93,7 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
     assert holds == (upset > 0)
 
 
-def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
+def test_navigation_without_tilt_measurements_does_not_learn_attitude_from_fixes():
     flown = Flown(10, wind=(5.0, 0.0), fix_sd_m=2.0)
     flown.look = lambda t_s, seen_m: (seen_m, {"attitude_gain_s2": 18.0})
     errors_m, said_m = flown.fly(460).errors(70)
@@ -128,7 +128,7 @@ class Received:
         return float(offset_m(*HOME, here.lat_deg, here.lon_deg)[0])
 
 
-def test_navigation_beside_accelerations_takes_the_receiver_and_never_the_estimate():
+def test_navigation_by_accelerations_uses_the_receiver_and_never_the_estimate():
     flown = Received().fly(20)
     assert flown.east_m == pytest.approx(0.0, abs=0.5)
     assert flown.navigation.has_gps
@@ -142,7 +142,7 @@ def test_navigation_allows_for_the_lag_of_a_receiver():
     assert flown.east_m == pytest.approx(2.0 * 99, abs=1.5)
 
 
-def test_steady_receiver_that_contradicts_overrules_us_after_two_seconds():
+def test_steady_receiver_overrules_our_position_after_two_seconds():
     flown = Received().fly(20)
     flown.steady_since_s = flown.t_s
     flown.fly(1, off_m=150.0)
@@ -155,7 +155,7 @@ def test_steady_receiver_that_contradicts_overrules_us_after_two_seconds():
     assert flown.east_m == pytest.approx(150.0, abs=1.0)
 
 
-def test_receiver_that_contradicts_does_not_overrule_recent_matches():
+def test_contradicting_receiver_does_not_overrule_recent_matches():
     flown = Received().fly(20)
     for _ in range(5):
         flown.fly(1, off_m=150.0)
@@ -169,7 +169,7 @@ def test_receiver_that_contradicts_does_not_overrule_recent_matches():
 @pytest.mark.parametrize(
     ("zoom", "gap_s", "least_m", "most_m"), [(0.0, 0.0, 0.0, 8.0), (0.04, 0.0, 20.0, 60.0), (0.0, 8.0, 15.0, 60.0)]
 )
-def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
+def test_odometry_claims_the_error_of_unknown_terrain(zoom, gap_s, least_m, most_m):
     """A hundred metres without a match: over ground that seems flat, that falls away, and after a gap."""
     flown = Received().fly(10)
     flown.fly(gap_s, has_gps=False)
@@ -185,7 +185,7 @@ def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
     assert least_m <= flown.navigation._odometry_since_fix.error_m <= most_m
 
 
-def test_by_accelerations_alone_it_begins_with_a_fix():
+def test_navigation_by_accelerations_alone_starts_at_a_fix():
     flown = Flown(0, INERTIAL, fix_sd_m=2.0)
     assert flown.navigation.estimate_state(0.0) is None
     flown.navigation.start_at_fix(Position(*HOME), 3.0, -1.0, 0.0)

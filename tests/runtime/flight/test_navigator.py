@@ -41,7 +41,7 @@ def said_states(air, from_s=0.0):
 
 
 @pytest.mark.parametrize("begins_anew", [False, True])
-def test_fixes_that_err_otherwise_from_now_on_are_believed_where_it_begins_anew(begins_anew):
+def test_fixes_with_a_new_error_are_accepted_after_a_reset(begins_anew):
     air = Air(Navigator(1.0, 1.0))
     air.map_off = air.map_off + np.array((16.0, 0.0))
     air.fly(120)
@@ -55,7 +55,7 @@ def test_fixes_that_err_otherwise_from_now_on_are_believed_where_it_begins_anew(
 
 
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0])
-def test_in_wind_an_autopilot_that_takes_what_is_sent_stays_within_metres(fix_sd_m):
+def test_navigator_keeps_an_autopilot_that_uses_its_fixes_within_metres_in_wind(fix_sd_m):
     air, alone = lost(wind=WIND, fix_sd_m=fix_sd_m), lost(wind=WIND)
     alone.takes_fixes = False
     errors_m = lengths(air.fly(300).errors_m)
@@ -66,7 +66,7 @@ def test_in_wind_an_autopilot_that_takes_what_is_sent_stays_within_metres(fix_sd
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("speed_m_s", [15.0, 7.0])
-def test_where_the_autopilot_reckons_well_nothing_that_is_sent_makes_it_worse(speed_m_s, seed):
+def test_navigator_never_worsens_good_dead_reckoning(speed_m_s, seed):
     """With matches as good as those over a refined map with ArduPilot in its simulator."""
     air = lost(speed_m_s=speed_m_s, fix_sd_m=0.6, said_sd_m=1.1, other_sd_m=0.0, seed=seed).fly(300)
     assert lengths(air.errors_m).max() < 3.0, "and alone it is exact"
@@ -81,7 +81,7 @@ HOWS = [
 
 
 @pytest.mark.parametrize("how", HOWS)
-def test_what_is_claimed_is_met(how):
+def test_navigator_claims_match_its_errors(how):
     known = []
     for seed in range(3):
         air = lost(seed=seed, **how).fly(10)
@@ -94,7 +94,7 @@ def test_what_is_claimed_is_met(how):
 
 
 @pytest.mark.parametrize("channel", [Channel.SENSOR, Channel.VISION])
-def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has(channel):
+def test_navigator_sends_positions_to_px4_only_without_gps(channel):
     navigator = Navigator(1.0, 1.0)
     navigator.handle_channel(channel)
     air = Air(navigator, wind=WIND).fly(30)
@@ -110,7 +110,7 @@ def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has(chann
     assert (abs(off_m) < 2 * claimed_m[:, None]).mean() > 0.92
 
 
-def test_where_the_attitude_is_unknown_a_fix_says_less():
+def test_navigator_claims_larger_errors_without_attitude():
     """At 100 m a tilt of 15 degrees is 27 m."""
     level, untold = lost(wind=WIND, fix_sd_m=1.0), lost(wind=WIND, fix_sd_m=1.0, attitude=(None, None))
     told, less = (air.fly(20).sent[-1][1].accuracy_m for air in (level, untold))
@@ -118,7 +118,7 @@ def test_where_the_attitude_is_unknown_a_fix_says_less():
     assert less > 10
 
 
-def test_after_a_silence_of_the_link_nothing_is_said_until_it_is_over_and_then_it_goes_on():
+def test_navigator_sends_nothing_during_a_link_outage_and_resumes_after_it():
     air = lost(wind=WIND).fly(60)
     air.is_silent = True
     air.fly(5)
@@ -130,7 +130,7 @@ def test_after_a_silence_of_the_link_nothing_is_said_until_it_is_over_and_then_i
     assert lengths(air.errors_m)[10:].max() < 20
 
 
-def test_an_autopilot_that_restarts_and_knows_nothing_is_sent_what_is_seen_and_navigated_again_by_what_it_says():
+def test_navigator_sends_matches_to_a_restarted_autopilot_and_resumes_with_its_reports():
     air = lost(wind=WIND).fly(60)
     air.knows_nothing = True
     air.off_m = np.array([-400.0, 900.0])  # where it began
@@ -146,7 +146,7 @@ def test_an_autopilot_that_restarts_and_knows_nothing_is_sent_what_is_seen_and_n
     assert lengths(air.errors_m).max() < 15
 
 
-def test_a_continuous_position_comes_ten_times_a_second_and_does_not_jump():
+def test_navigator_streams_ten_smooth_positions_a_second():
     air = lost(inertial(Navigator(1.0, 1.0)))
     air.fly(20)
     moved_s = air.t_s
@@ -168,7 +168,7 @@ def test_a_continuous_position_comes_ten_times_a_second_and_does_not_jump():
     assert last.accuracy_m / LIKE_ONE < 4
 
 
-def test_a_continuous_position_holds_and_says_how_good_it_is():
+def test_navigator_stream_stays_accurate_and_reports_its_accuracy():
     air = lost(inertial(Navigator(1.0, 1.0)), bias=(0.05, -0.03), fix_sd_m=2.0).fly(200)
     states = said_states(air, 40)
     assert len(states) == pytest.approx(1900, abs=3)
@@ -190,7 +190,7 @@ class OnlyAtMatches(Navigator):
         return None
 
 
-def test_between_matches_what_they_have_shown_of_the_wind_is_sent():
+def test_navigator_sends_the_observed_drift_between_matches():
     how = {"wind": WIND, "every_s": 10.0}
     air, other = lost(**how), lost(OnlyAtMatches(1.0, 10.0), **how)
     errors_m, others_m = (lengths(each.fly(300).errors_m)[60:] for each in (air, other))
@@ -199,7 +199,7 @@ def test_between_matches_what_they_have_shown_of_the_wind_is_sent():
     assert np.median(errors_m) < 0.4 * np.median(others_m)
 
 
-def test_what_is_claimed_between_matches_is_met():
+def test_navigator_claims_match_its_errors_between_matches():
     runs = [lost(wind=WIND, gusts=0.3, every_s=10.0, seed=seed).fly(300) for seed in range(3)]
     sigmas = np.concatenate([off_m / fix.accuracy_m for run in runs for fix, off_m in run.between])
     assert len(sigmas) > 300

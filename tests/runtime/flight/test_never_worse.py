@@ -48,7 +48,7 @@ def test_receiver_with_few_satellites_is_not_outbid(satellites, matches):
 
 
 @with_and_without_matches
-def test_source_set_with_odometry_does_not_run_away_beside_gps(matches):
+def test_source_set_with_odometry_does_not_diverge_with_gps(matches):
     def choose_second_set(flight):
         if flight.conversation:
             flight.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2)
@@ -62,7 +62,7 @@ def test_source_set_with_odometry_does_not_run_away_beside_gps(matches):
 @pytest.mark.parametrize(
     "parameters", [{"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, {"GPS_AUTO_SWITCH": 2}], ids=["primary", "blended"]
 )
-def test_receiver_of_ours_in_use_beside_gps_does_not_run_away(parameters, matches):
+def test_receiver_of_ours_does_not_diverge_while_used_with_gps(parameters, matches):
     assert_no_worse("arducopter", lambda flight: None, matches=matches, **GPS_INPUT, **parameters)
 
 
@@ -80,7 +80,7 @@ def test_px4_is_on_gps_again_after_flight_over_lower_ground(parameters):
     assert not flight.positions_sent(back_s)
 
 
-def test_px4_without_gps_or_picture_gets_nothing_and_operator_is_told():
+def test_px4_without_gps_or_images_gets_nothing_and_the_operator_is_informed():
     flight = ClosedLoop("px4-copter", matches=False, **SENSOR).fly(SETTLED_S)
     assert flight.navigator.output is Output.GPS_IN_USE
     flight.sees_motion = False
@@ -89,7 +89,7 @@ def test_px4_without_gps_or_picture_gets_nothing_and_operator_is_told():
     assert not flight.positions_sent(0)
 
 
-def test_strides_over_lower_ground_are_right_where_matches_have_shown_its_height():
+def test_odometry_over_lower_ground_is_correct_once_matches_show_its_height():
     """Strides alone, 1.4 times short: uncorrected they lose 86 m in 20 s."""
     flight = ClosedLoop("px4-copter", matches=False, velocity_m_s=10j, **SENSOR).fly(SETTLED_S)
     flight.set("SIM_GPS1_ENABLE", 0)
@@ -145,14 +145,14 @@ def test_paused_flight_sends_no_position_on_any_channel(vehicle, parameters):
 @pytest.mark.parametrize(
     ("vehicle", "parameters"), [("px4-copter", SENSOR), ("px4-copter", VISION), ("arducopter", GPS_INPUT)]
 )
-def test_map_that_is_off_moves_no_aircraft_with_good_gps(vehicle, parameters):
+def test_map_with_an_offset_moves_no_aircraft_with_good_gps(vehicle, parameters):
     def shift_map(flight):
         flight.map_off_m = 8
 
     assert_no_worse(vehicle, shift_map, watched_s=60.0, **parameters)
 
 
-def test_copter_whose_second_receiver_we_are_flies_on_after_the_loss_of_gps():
+def test_copter_with_our_receiver_continues_after_the_loss_of_gps():
     flight = ClosedLoop("arducopter", **GPS_INPUT).fly(20)
     lost_s = flight.set("SIM_GPS1_ENABLE", 0).now_s
     assert flight.fly(40).error_m[-1] < 4
@@ -167,7 +167,7 @@ def test_copter_whose_second_receiver_we_are_flies_on_after_the_loss_of_gps():
     assert not flight.brain.flags() & HAS_POSITION
 
 
-def test_plane_gets_single_fixes_after_the_loss_only_and_takes_them():
+def test_plane_gets_and_accepts_single_fixes_only_after_the_loss_of_gps():
     flight = ClosedLoop("arduplane", matches=False).fly(10)
     flight.matches, flight.sees_motion = True, False
     assert not flight.fly(20).positions_sent(0)

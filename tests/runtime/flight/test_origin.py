@@ -42,7 +42,7 @@ def test_find_origin_has_the_altitude_of_the_ground(places, ground_m):
     assert find_origin(places, source) == Position(51.0, 8.0, None if ground_m is None else pytest.approx(ground_m))
 
 
-def test_find_origin_without_a_lens_or_a_position_knows_no_altitude():
+def test_find_origin_has_no_altitude_without_lens_or_position():
     source = load_config(None, {}).source
     assert find_origin(place_map([634.0]), source) == Position(51.0, 8.0, None)
     assert find_origin(place_map([]), source) is None

@@ -59,7 +59,7 @@ def withdrawn(*reports):
         (3.0, REFUSES | {"fixed_ago_s": 5.1}, Output.REFUSED),
     ],
 )
-def test_positions_are_withdrawn_that_lead_away_or_are_refused(last_s, known, output):
+def test_output_withdraws_positions_that_mislead_or_are_refused(last_s, known, output):
     assert withdrawn((0.0, known), (1.0, known), (last_s, known)) is output
     assert withdrawn((0.0, known), (1.0, {}), (last_s, known)) is None, "not all the time"
 

@@ -10,7 +10,7 @@ from edgevpr.runtime.flight.path import HISTORY_S, Path, to_ground_acceleration
 HOME = Position(47.0, 8.0)
 
 
-def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on():
+def test_path_keeps_the_last_seconds_and_extrapolates_with_the_velocity():
     path = Path(HOME, 0.0, (1.0, 0.0))
     for step in range(1, 2001):
         path.add_velocity(step / 10, (1.0, 0.0))
@@ -20,7 +20,7 @@ def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on(
     assert path.interpolate(201.1) is None
 
 
-def test_a_silence_breaks_a_path():
+def test_path_breaks_at_a_gap():
     path = Path(HOME, 0.0, (1.0, 0.0))
     path.add_velocity(0.9, (1.0, 0.0))
     assert not path.is_broken
@@ -31,7 +31,7 @@ def test_a_silence_breaks_a_path():
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 77.0, -160.0])
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (30.0, 0.0), (0.0, -20.0), (-35.0, 12.0)])
-def test_what_accelerometers_feel_without_gravity_is_the_acceleration_over_the_ground(roll_deg, pitch_deg, yaw_deg):
+def test_to_ground_acceleration_removes_gravity(roll_deg, pitch_deg, yaw_deg):
     earth_from_body = Rotation.from_euler("ZYX", (yaw_deg, pitch_deg, roll_deg), degrees=True)
     north, east, down = 1.2, -0.7, 0.3
     felt = earth_from_body.inv().apply((north, east, down - 9.81))

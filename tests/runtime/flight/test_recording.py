@@ -22,7 +22,7 @@ def notes(folder):
     return list(read_tape(folder / TAPE))
 
 
-def test_what_is_read_and_noted_is_on_the_tape_in_its_order(tmp_path):
+def test_recording_writes_reads_and_notes_in_order(tmp_path):
     with Recording(tmp_path / "r", 100) as tape:
         assert tape.read("one", lambda: 0.1 + 0.2) == 0.1 + 0.2
         tape.note("two", [1, "a"], None)
@@ -32,7 +32,7 @@ def test_what_is_read_and_noted_is_on_the_tape_in_its_order(tmp_path):
 
 
 @pytest.mark.parametrize("is_grey", [False, True])
-def test_a_flight_goes_on_with_the_picture_as_it_is_kept(tmp_path, is_grey):
+def test_recording_gives_the_flight_the_stored_image(tmp_path, is_grey):
     pictures = [textured(number, 240, 320) for number in range(3)]
     pictures = [np.ascontiguousarray(each[:, :, 0]) if each.ndim == 3 and is_grey else each for each in pictures]
     clock = FakeClock()
@@ -54,13 +54,13 @@ def test_a_flight_goes_on_with_the_picture_as_it_is_kept(tmp_path, is_grey):
     assert again.state == state
 
 
-def test_a_password_in_an_address_is_not_kept(tmp_path):
+def test_recording_hides_passwords_in_addresses(tmp_path):
     with Recording(tmp_path, 100) as tape:
         tape.note("flight", {"uri": "rtsp://pilot:secret@camera/1"})
     assert "secret" not in (tape.path / TAPE).read_text()
 
 
-def test_each_flight_has_a_folder_and_the_oldest_make_room(tmp_path):
+def test_recording_uses_one_folder_per_flight_and_deletes_the_oldest(tmp_path):
     for number in range(4):
         with Recording(tmp_path, 10) as tape:
             tape.keep(bytes(2_000_000))
@@ -72,7 +72,7 @@ def test_each_flight_has_a_folder_and_the_oldest_make_room(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
+def test_recording_ends_at_its_size_limit_and_reports_it(tmp_path, caplog):
     with caplog.at_level(logging.WARNING), Recording(tmp_path, 10) as tape:
         for _ in range(4):
             tape.keep(bytes(1_500_000))
@@ -88,7 +88,7 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
 
 
 @pytest.mark.slow
-def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
+def test_recording_ends_on_a_full_disk_without_ending_the_flight(tmp_path):
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
         wait_until(lambda: not tape._queue)
@@ -102,7 +102,7 @@ def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
+def test_recording_leaves_reserved_disk_space_for_logs_and_map(tmp_path, monkeypatch):
     disk = os.statvfs(tmp_path)
     monkeypatch.setattr(module, "MIN_FREE_BYTES", disk.f_bavail * disk.f_frsize + 10**12)
     with Recording(tmp_path, 100) as tape:

@@ -46,7 +46,7 @@ def seen(notifier, clock, link):
     return Seen(notifier, clock, link)
 
 
-def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two(seen, tmp_path):
+def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_matches(seen, tmp_path):
     assert seen.look("+++" + "-" * 29) == []
     assert seen.look("-") == ["aircraft has left the map"]
     assert seen.look("-" * 50) == ["aircraft has left the map"]
@@ -68,17 +68,17 @@ def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two
         ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, ["aircraft has left the map"]),  # matches far apart
     ],
 )
-def test_the_map_is_left_and_found_by_several_queries_only(seen, outcomes, texts):
+def test_sight_requires_several_queries_to_leave_or_find_the_map(seen, outcomes, texts):
     assert seen.look(outcomes) == texts
 
 
 @pytest.mark.parametrize("outcome", "0xtnu")
-def test_what_says_nothing_of_the_map_does_not_count(seen, outcome):
+def test_sight_ignores_queries_without_information_about_the_map(seen, outcome):
     assert "aircraft has left the map" not in seen.look("+++" + "-" * 29 + outcome * 40)
     assert seen.look("-")[-1] == "aircraft has left the map"
 
 
-def test_a_tilt_is_told_when_it_lasts_five_seconds_and_when_it_is_over_for_as_long(seen, tmp_path):
+def test_sight_reports_tilt_after_five_seconds_and_its_end(seen, tmp_path):
     assert seen.look("-" + "t" * 5) == []
     assert seen.look("t") == ["tilt too large"]
     assert seen.look("-----") == ["tilt too large"]
@@ -87,7 +87,7 @@ def test_a_tilt_is_told_when_it_lasts_five_seconds_and_when_it_is_over_for_as_lo
 
 
 @pytest.mark.slow
-def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock, link):
+def test_sight_reports_a_flight_that_leaves_its_map_and_returns(make_flight, clock, link):
     lines = make_flight().fly(FakeSource([*pictures(8), *pictures(40, first=100), *pictures(8)], clock))
     assert link.texts() == [(4, "edgevpr: aircraft has left the map"), (6, "edgevpr: aircraft is back on the map")]
     assert [line["note"]["code"] for line in of_kind(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
@@ -104,7 +104,7 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock,
         ([20, 80], []),
     ],
 )
-def test_pictures_that_are_turned_against_the_heading_are_said_once(notifier, link, rotation_deg, said):
+def test_sight_reports_images_rotated_from_the_heading_once(notifier, link, rotation_deg, said):
     source = load_config(None, {"source.up_deg": 300.0}).source
     watch = TurnWatch(notifier, source)
     view = SimpleNamespace(up_deg=350.0, reason=None)
@@ -119,7 +119,7 @@ def test_pictures_that_are_turned_against_the_heading_are_said_once(notifier, li
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(make_flight, clock, link, axis):
+def test_mirrored_images_are_reported_once_and_only_if_none_matches(make_flight, clock, link, axis):
     mirrored = [np.flip(picture, axis).copy() for picture in pictures(8)]
     lines = make_flight().fly(FakeSource([*mirrored, *mirrored, *mirrored[:4]], clock))
     assert not any(line["accepted"] for line in of_kind(lines, "query"))

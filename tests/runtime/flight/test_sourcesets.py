@@ -53,7 +53,7 @@ class Flown(Air):
         return [number for _, number in self.asked]
 
 
-def test_the_set_without_gps_is_asked_for_once_and_the_other_after_ten_seconds_of_gps():
+def test_source_sets_request_the_set_without_gps_once_and_the_other_after_ten_seconds_of_gps():
     flown = Flown(**SETS).fly(5)
     assert flown.numbers == []
     lost_s = flown.t_s
@@ -66,7 +66,7 @@ def test_the_set_without_gps_is_asked_for_once_and_the_other_after_ten_seconds_o
     assert flown.asked[1][0] >= found_s + 10
 
 
-def test_a_receiver_that_is_wrong_counts_as_none():
+def test_source_sets_treat_a_wrong_receiver_as_none():
     flown = Flown(**SETS)
     flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=True)
     assert flown.fly(3).numbers == [2]
@@ -74,7 +74,7 @@ def test_a_receiver_that_is_wrong_counts_as_none():
     assert flown.fly(15).numbers == [2, 1]
 
 
-def test_a_receiver_that_never_agreed_with_the_map_stays_in_use():
+def test_source_sets_keep_a_receiver_that_never_agreed_with_the_map():
     flown = Flown(**SETS)
     flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=False)
     assert flown.fly(3).numbers == []
@@ -83,14 +83,14 @@ def test_a_receiver_that_never_agreed_with_the_map_stays_in_use():
 @pytest.mark.parametrize(
     "settings", [{}, {"source_sets.gps": 1}, {"source_sets.no_gps": 2}, SETS | {"send_fixes": False}]
 )
-def test_without_both_numbers_and_in_a_dry_run_none_is_asked_for(settings):
+def test_source_sets_request_nothing_without_both_sets_or_in_a_dry_run(settings):
     flown = Flown(**settings)
     flown.lose_gps()
     flown.fly(20).find_gps()
     assert flown.fly(20).numbers == []
 
 
-def test_a_question_that_is_not_answered_is_asked_again():
+def test_source_sets_repeat_an_unanswered_request():
     sets = SourceSets(ALLOWED)
     asked = [sets.choose_set(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER) for t_s in range(30)]
     assert [t_s / 2 for t_s, number in enumerate(asked) if number == 2] == [0, 2, 4]
@@ -98,7 +98,7 @@ def test_a_question_that_is_not_answered_is_asked_again():
     assert sets.choose_set(43.0, True, True, answered_s=5.1) == 1, "that answer was for the other one"
 
 
-def test_without_a_position_of_ours_none_is_asked_for():
+def test_source_sets_request_nothing_without_a_position_of_ours():
     sets = SourceSets(ALLOWED)
     assert sets.choose_set(0.0, has_gps=False, has_own=False, answered_s=NEVER) is None
     assert sets.choose_set(1.0, has_gps=False, has_own=True, answered_s=NEVER) == 2

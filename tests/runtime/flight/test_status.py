@@ -20,7 +20,7 @@ def path(tmp_path):
     return tmp_path / "status.json"
 
 
-def test_what_is_told_is_read_again_and_the_file_goes_with_the_flight(path):
+def test_read_status_reads_what_was_written_until_the_flight_ends(path):
     with StatusFile(path) as told:
         assert read_status(path) is None
         for queries in (7, 8):
@@ -33,7 +33,7 @@ def test_what_is_told_is_read_again_and_the_file_goes_with_the_flight(path):
     assert read_status(path) is None
 
 
-def test_the_mode_is_the_same_under_any_umask_and_what_was_left_is_replaced(path):
+def test_status_file_has_the_same_mode_under_any_umask_and_replaces_leftovers(path):
     path.write_text("left by a flight that was killed")
     before = os.umask(0o077)
     try:
@@ -46,19 +46,19 @@ def test_the_mode_is_the_same_under_any_umask_and_what_was_left_is_replaced(path
 
 
 @pytest.mark.parametrize("name", ["nowhere/status", ".", "x" * 300])
-def test_a_file_that_cannot_be_made_is_refused_by_name(tmp_path, name):
+def test_status_file_refuses_an_unwritable_path_by_name(tmp_path, name):
     with pytest.raises(EdgevprError, match=r"status\.file"):
         StatusFile(tmp_path / name)
 
 
 @pytest.mark.parametrize("text", ["", "no JSON", "[]", '{"version": 1}', "[" * 100_000])
-def test_what_is_no_status_is_refused_by_name(path, text):
+def test_read_status_refuses_other_files_by_name(path, text):
     path.write_text(text)
     with pytest.raises(EdgevprError, match=path.name):
         read_status(path)
 
 
-def test_top_shows_the_status_of_a_flight_and_none_of_one_that_is_gone(make_flight, clock, path, capsys):
+def test_top_shows_the_status_of_a_running_flight_only(make_flight, clock, path, capsys):
     assert "--file" in refused(capsys, "top", "--file", path, "--once", code=1)
     with StatusFile(path) as told:
         make_flight().fly(FakeSource([*pictures(2), *pictures(1, first=100)], clock), status=told)
@@ -72,12 +72,12 @@ def test_top_shows_the_status_of_a_flight_and_none_of_one_that_is_gone(make_flig
     ("folder", "usual"),
     [("/run/edgevpr", "/run/edgevpr/status.json"), ("/run/a:/run/b", "/run/a/status.json"), ("", None)],
 )
-def test_a_service_has_a_folder_for_it(monkeypatch, folder, usual):
+def test_find_default_path_uses_the_folder_of_the_service(monkeypatch, folder, usual):
     monkeypatch.setenv("RUNTIME_DIRECTORY", folder)
     assert find_default_path() == usual
 
 
-def test_a_disk_that_is_full_ends_no_flight(path):
+def test_status_file_tolerates_a_full_disk(path):
     with StatusFile(path) as told:
         path.with_name(f"{path.name}.new").mkdir()
         told.write(STATUS)

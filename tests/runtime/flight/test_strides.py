@@ -48,7 +48,7 @@ def across_a_gap(air, seconds=GAP_S):
 
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
 @pytest.mark.parametrize(("stretch", "turn"), [(1.0, 0.0), (1.05, 0.0), (1.0, 0.06)])
-def test_a_minute_off_the_map_is_bridged_to_three_per_cent_of_the_way(channel, stretch, turn):
+def test_odometry_bridges_a_minute_off_the_map_to_three_per_cent_of_the_distance(channel, stretch, turn):
     air = air_of(channel, stride_sd_m=0.2)
     air.stretch, air.turn = stretch, turn
     errors_m, said_m = across_a_gap(air)
@@ -58,13 +58,13 @@ def test_a_minute_off_the_map_is_bridged_to_three_per_cent_of_the_way(channel, s
     assert said_m[-1] < 0.04 * way_m
 
 
-def test_without_strides_the_same_gap_is_not_bridged():
+def test_gap_without_odometry_is_not_bridged():
     errors_m, said_m = across_a_gap(air_of(Channel.COMMAND))
     assert lengths(errors_m).max() > 30.0
     assert said_m[-1] > 30.0
 
 
-def test_a_hover_is_told_and_holds_its_place():
+def test_odometry_holds_the_position_in_a_hover():
     air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2, speed_m_s=0.0)
     errors_m, said_m = across_a_gap(air, seconds=120)
     assert lengths(errors_m).max() < 4.0
@@ -73,7 +73,7 @@ def test_a_hover_is_told_and_holds_its_place():
     assert np.hypot(*state.velocity_m_s[:2]) < 0.5
 
 
-def test_the_autopilot_is_held_in_the_gap():
+def test_odometry_keeps_the_autopilot_accurate_across_the_gap():
     air = air_of(Channel.COMMAND, stride_sd_m=0.2)
     across_a_gap(air)
     assert len(air.between) > 15
@@ -81,7 +81,7 @@ def test_the_autopilot_is_held_in_the_gap():
     assert lengths(air.errors_m[-30:]).max() < 35.0
 
 
-def test_a_stride_that_contradicts_the_path_is_not_believed():
+def test_odometry_that_contradicts_the_path_is_rejected():
     air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2)
     without_gps(air, 30)
     before_m, _ = off_m(air)
@@ -93,17 +93,17 @@ def test_a_stride_that_contradicts_the_path_is_not_believed():
 
 
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
-def test_matches_of_ground_that_repeats_itself_must_be_four_to_overrule_a_path_that_is_followed(channel):
+def test_matches_need_four_to_overrule_a_tracked_path_over_repetitive_ground(channel):
     air = without_gps(air_of(channel, stride_sd_m=0.2), 30)
     assert beside_m(air, 3)[0] < 8.0, "three that agree with each other are not believed"
     assert beside_m(air, 3)[1] < 8.0, "matches win in the end"
 
 
-def test_without_strides_two_overrule_it():
+def test_two_fixes_overrule_the_path_without_odometry():
     assert beside_m(without_gps(air_of(Channel.COMMAND), 30), 3)[1] < 15.0
 
 
-def test_matches_win_where_a_slow_copter_sees_the_same_places_for_long():
+def test_matches_overrule_the_path_of_a_slow_copter_over_the_same_places():
     air = air_of(Channel.GPS_INPUT, stride_sd_m=0.2, speed_m_s=7.0)
     air.places = lambda step: tuple(range(step // 150, step // 150 + 12))  # those of 36 s
     assert beside_m(without_gps(air, 30), 15)[1] < 8.0
@@ -112,7 +112,7 @@ def test_matches_win_where_a_slow_copter_sees_the_same_places_for_long():
 RARE = {"every_s": 10.0, "stride_s": 2.0, "stride_sd_m": 0.2}
 
 
-def test_between_queries_ten_seconds_apart_the_position_is_carried_by_pictures_that_are_no_queries():
+def test_odometry_frames_hold_the_position_between_queries_ten_seconds_apart():
     def largest_m(**how):
         return lengths(without_gps(air_of(Channel.COMMAND, **RARE | how), 60).errors_m[-59:]).max()
 
@@ -121,7 +121,7 @@ def test_between_queries_ten_seconds_apart_the_position_is_carried_by_pictures_t
 
 
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
-def test_rare_matches_overrule_such_a_path_by_two(channel):
+def test_matches_need_two_to_overrule_a_tracked_path_if_rare(channel):
     air = without_gps(air_of(channel, **RARE), 60)
     assert beside_m(air, 25)[1] < 15.0
 
@@ -140,6 +140,6 @@ def with_a_compass_that_goes_wrong(shows_turn, seed):
     return lengths(air.fly(60).errors_m).max()
 
 
-def test_a_compass_that_goes_wrong_when_gps_is_lost_is_known_by_the_turn_of_matches():
+def test_compass_error_after_gps_loss_is_estimated_from_the_rotation_of_matches():
     assert max(with_a_compass_that_goes_wrong(True, seed) for seed in range(6)) < 7.0
     assert max(with_a_compass_that_goes_wrong(False, seed) for seed in range(6)) > 10.0, "by strides that lead astray"

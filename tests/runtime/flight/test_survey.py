@@ -100,7 +100,7 @@ def wrong_m(found):
 
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
 @pytest.mark.parametrize("way", [eight, lanes])
-def test_offset_scale_and_mount_are_told_apart(way, wrong):
+def test_survey_separates_offset_scale_and_mount(way, wrong):
     for seed in range(4):
         found = surveyed(way, 900, seed=seed, wrong=wrong)
         assert all(each.is_known for each in found.measures.values())
@@ -110,7 +110,7 @@ def test_offset_scale_and_mount_are_told_apart(way, wrong):
         assert found.measures["right_deg"].value[0] == pytest.approx(RIGHT_DEG, abs=2 * found.measures["right_deg"].sd)
 
 
-def test_standard_deviations_are_honest():
+def test_survey_standard_deviations_match_the_errors():
     """Over many flights the errors are as large as is said, neither half nor double of it."""
     found = [surveyed(eight, 600, seed=seed) for seed in range(30)]
     shares = np.array([wrong_m(each) / each.measures["off_m"].sd for each in found])
@@ -120,7 +120,7 @@ def test_standard_deviations_are_honest():
 
 
 @pytest.mark.parametrize(("way", "wrong", "known"), [(circle, 0.0, ["off_m", "ahead_deg"]), (line, 0.05, ["scale"])])
-def test_survey_knows_only_what_a_way_tells_apart(way, wrong, known):
+def test_survey_finds_only_what_the_route_separates(way, wrong, known):
     found = surveyed(way, 900, wrong=wrong)
     assert [name for name, each in found.measures.items() if each.is_known] == known
     assert (found.fields()["off_m"] is None) == (way is line)
@@ -130,7 +130,7 @@ def test_survey_knows_only_what_a_way_tells_apart(way, wrong, known):
         assert ahead.value[0] == pytest.approx(AHEAD_DEG, abs=2 * ahead.sd)
 
 
-def test_a_mount_is_told_by_the_turn_of_the_picture_where_the_compass_is_wrong():
+def test_survey_measures_the_mount_from_image_rotation_with_a_wrong_compass():
     found = surveyed(lanes, 600, compass_deg=90.0)
     assert found.measures["ahead_deg"].value[0] == pytest.approx(AHEAD_DEG, abs=1.0)
     assert found.measures["right_deg"].value[0] == pytest.approx(RIGHT_DEG, abs=1.0)
@@ -148,11 +148,11 @@ def test_a_mount_is_told_by_the_turn_of_the_picture_where_the_compass_is_wrong()
         {"gps": receiver_at(HOME, 8.0, 0.0)},
     ],
 )
-def test_without_gps_or_attitude_nothing_is_found(said):
+def test_survey_finds_nothing_without_gps_or_attitude(said):
     assert surveyed(lanes, 300, **said) is None
 
 
-def test_a_position_that_may_be_ours_is_not_gps():
+def test_survey_uses_the_receiver_and_not_a_position_derived_from_ours():
     """After a fix of ours the autopilot may repeat it: the receiver itself counts, which is 0.1 s late here."""
     rng = np.random.default_rng(3)
     sightings = MapSurvey(STRAIGHT_DOWN, is_level=False)
@@ -200,7 +200,7 @@ class Flown:
         self.texts = [text for _, text in link.texts() if "GPS is" not in text and "GPS agrees" not in text]
 
 
-def test_it_is_said_once_and_at_the_end(tmp_path):
+def test_survey_is_reported_once_and_at_the_end(tmp_path):
     flown = Flown(tmp_path, events(eight, 1800))
     *_, last = flown.lines
     assert 2 <= len(flown.lines) <= 5, "one for each that becomes known, and the end"
@@ -221,7 +221,7 @@ def right(way=lanes, seconds=900):
         yield replace(event, located=replace(event.located, position=at))
 
 
-def test_a_map_and_a_camera_that_are_right_are_not_talked_of(tmp_path):
+def test_survey_does_not_report_a_correct_map_and_camera(tmp_path):
     flown = Flown(tmp_path, right())
     assert flown.texts == []
     (end,) = flown.lines
@@ -251,11 +251,11 @@ def led(law, flight):
         lambda t_s: 40.0,
     ],
 )
-def test_of_a_gps_that_is_wrong_nothing_is_learnt(tmp_path, law, way):
+def test_survey_learns_nothing_from_wrong_gps(tmp_path, law, way):
     assert Flown(tmp_path, led(law, right(way))).lines == []
 
 
-def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
+def test_survey_withdraws_its_report_when_gps_becomes_wrong(tmp_path):
     flown = Flown(tmp_path, led(lambda t_s: 60.0 * (t_s > 700), events(eight, 1200)))
     assert flown.lines[0]["off_m"]
     assert "off_m" not in flown.lines[-1]
@@ -265,7 +265,7 @@ def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
 
 @pytest.mark.parametrize("map_sd_m", [5.0, 1.0])
 @pytest.mark.parametrize("way", [eight, lanes, circle])
-def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tmp_path, way, map_sd_m):
+def test_images_are_levelled_by_the_measured_mount_so_that_gps_agrees(tmp_path, way, map_sd_m):
     flown = Flown(tmp_path, events(way, 1800, scale=0.0), map_sd_m)
     known_s = next(line["t_mono_s"] for line in flown.lines if line["ahead_deg"])
     assert known_s < 400
@@ -277,7 +277,7 @@ def test_pictures_are_levelled_by_the_mount_that_is_found_and_then_gps_agrees(tm
     assert flown.lines[-1]["ahead_deg"] == pytest.approx(AHEAD_DEG, abs=1.0), "it is still what is to be set"
 
 
-def test_a_gps_that_is_led_away_is_found_after_a_mount_was(tmp_path):
+def test_survey_finds_spoofed_gps_after_measuring_the_mount(tmp_path):
     flown = Flown(tmp_path, led(lambda t_s: max(0.0, t_s - 1500), events(eight, 1800, scale=0.0)))
     assert 1500 < min(t_s for t_s in flown.alarms_s if t_s > 1450) < 1530
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5), "a mount that is known stays"

@@ -19,7 +19,7 @@ def manager(tmp_path, monkeypatch):
         yield receiver
 
 
-def test_an_abstract_socket_is_reached_by_all_assignments_in_one_datagram(monkeypatch):
+def test_notify_sends_all_assignments_in_one_datagram_to_an_abstract_socket(monkeypatch):
     name = f"edgevpr-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.settimeout(5)
@@ -36,19 +36,19 @@ def test_an_abstract_socket_is_reached_by_all_assignments_in_one_datagram(monkey
         ("rtsp://pilot:secret@cam \x1b[31m lost", b"STATUS=rtsp://pilot:***@cam \\x1b[31m lost"),
     ],
 )
-def test_no_value_of_a_status_is_an_assignment_a_password_or_an_escape(manager, status, sent):
+def test_notify_escapes_status_values(manager, status, sent):
     notify(STATUS=status)
     assert manager.recv(4096) == sent
 
 
 @pytest.mark.parametrize("address", ["/nowhere/notify", "vsock:2:1234", "/" + "x" * 200, "@" + "x" * 200])
-def test_an_address_that_cannot_be_reached_is_no_error(monkeypatch, address):
+def test_notify_ignores_an_unreachable_address(monkeypatch, address):
     monkeypatch.setenv("NOTIFY_SOCKET", address)
     notify(WATCHDOG=1)
 
 
 @pytest.mark.slow
-def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
+def test_notify_never_blocks_on_a_manager_that_does_not_read(manager):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
         other.setblocking(False)
         with suppress(BlockingIOError):
@@ -69,7 +69,7 @@ def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
         ("-5", None, None),
     ],
 )
-def test_watchdog_interval_is_half_of_the_time_of_this_process(monkeypatch, timeout_us, pid_ahead, interval_s):
+def test_watchdog_interval_s_is_half_the_timeout_of_this_process(monkeypatch, timeout_us, pid_ahead, interval_s):
     pid = None if pid_ahead is None else os.getpid() + pid_ahead
     for name, value in (("WATCHDOG_USEC", timeout_us), ("WATCHDOG_PID", pid)):
         monkeypatch.delenv(name, raising=False)

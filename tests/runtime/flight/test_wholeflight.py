@@ -40,7 +40,7 @@ def flown(path) -> list[Path]:
     return files
 
 
-def test_the_newest_file_gives_the_whole_flight_with_one_start_line(path, flown):
+def test_select_last_flight_reads_the_whole_flight_with_one_start_line(path, flown):
     whole = select_last_flight(path)
     lines = list(whole)
     assert [line["kind"] for line in lines] == ["start", *["query"] * 4, "end"]
@@ -51,20 +51,20 @@ def test_the_newest_file_gives_the_whole_flight_with_one_start_line(path, flown)
     assert list(whole) == lines, "it can be read twice"
 
 
-def test_a_file_with_a_number_gives_the_flight_up_to_its_end(flown):
+def test_select_last_flight_reads_up_to_the_end_of_a_numbered_file(flown):
     assert numbers(select_last_flight(flown[0])) == [0]
     assert numbers(select_last_flight(flown[1])) == [0, 1]
     assert numbers(select_last_flight(flown[4])) == [100, 101, 102]
 
 
-def test_a_file_that_is_missing_is_said_and_the_rest_is_read(path, flown):
+def test_select_last_flight_reports_a_missing_file_and_reads_the_rest(path, flown):
     flown[3].unlink()
     whole = select_last_flight(path)
     assert numbers(whole) == [100, 102, 103]
     assert whole.missing == f"Files of this flight before {path} are missing (1): it is read without them."
 
 
-def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown):
+def test_select_last_flight_skips_truncated_lines_of_each_file(path, flown):
     for each in flown[2:5]:
         os.truncate(each, each.stat().st_size - 10)
     with open(path, "ab") as newest:
@@ -73,7 +73,7 @@ def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown)
     assert select_last_flight(path).missing is None
 
 
-def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another(path):
+def test_select_last_flight_accepts_a_repeated_start_line_after_a_storage_change(path):
     start = {"kind": "start", "time": "t", "t_mono_s": 1.0}
     again = {**start, "repeated": True, "part": 2}
     lines = [start, {"kind": "query", "n": 1}, again, {"kind": "query", "n": 2}]
@@ -88,7 +88,7 @@ def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another
     assert select_last_flight(path).missing is None
 
 
-def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
+def test_select_last_flight_refuses_other_files_in_one_sentence(tmp_path):
     (tmp_path / "empty").touch()
     with pytest.raises(EdgevprError, match="no flight-log lines"):
         select_last_flight(tmp_path / "empty")

@@ -94,7 +94,7 @@ def test_probe_tries_a_technique_on_frames_of_a_camera_and_a_map_on_disk():
     assert min(costs.encode.wall_s, costs.match_per_place.wall_s, costs.match_per_place.cpu_s) > 0
 
 
-def test_probe_does_not_count_what_other_programs_take():
+def test_probe_excludes_the_load_of_other_programs():
     technique, now = TinyTechnique(fine=True), {"wall": 0.0, "cpu": 0.0}
     others_s = itertools.cycle([0.9, 0.3, 0.0])
 
@@ -109,7 +109,7 @@ def test_probe_does_not_count_what_other_programs_take():
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 
-def test_choose_best_takes_the_most_accurate_that_fits(accuracies):
+def test_choose_best_returns_the_most_accurate_that_fits(accuracies):
     assert chosen(board(), COSTS, places=100) == "regions"
     assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
     assert chosen(board(), COSTS, places=300) == "vector", "regions are too slow"
@@ -121,7 +121,7 @@ def test_choose_best_takes_the_most_accurate_that_fits(accuracies):
     assert chosen(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
 
 
-def test_choose_best_never_takes_what_has_accepted_wrong_places(accuracies):
+def test_choose_best_never_returns_one_that_accepted_wrong_places(accuracies):
     accuracies["regions"] = found(0.9, wrong=1)
     assert chosen(board(), COSTS, 100) == "vector"
     assert chosen(board(technique="regions"), COSTS, 100) == "vector"
@@ -153,13 +153,13 @@ def test_make_option_counts_the_whole_map_in_ram_and_its_candidates_in_time():
     assert "RAM" in fit(board(), two_stages, 100_100).misfit
 
 
-def test_make_option_limits_a_technique_that_keeps_all_cores_busy_by_the_cpu_share():
+def test_make_option_limits_the_rate_of_a_multicore_technique_by_the_cpu_share():
     four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
     assert fit(board(cpu_share=1.0), four_threads, 100).reachable_hz == pytest.approx(1 / 0.2)
     assert fit(board(cpu_share=0.25), four_threads, 100).reachable_hz == pytest.approx(1 / 0.8)
 
 
-def test_make_option_refuses_any_rate_where_no_fix_could_be_sent_in_time():
+def test_make_option_refuses_rates_at_which_fixes_would_be_too_late():
     slow = fit(board(), REGIONS, places=1300, rate_hz=0.1)
     assert slow.t_query_s == pytest.approx(5.3)
     assert "takes 5.3 s" in slow.misfit
@@ -167,7 +167,7 @@ def test_make_option_refuses_any_rate_where_no_fix_could_be_sent_in_time():
 
 
 @pytest.mark.slow
-def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, caplog, accuracies):
+def test_pick_technique_skips_a_missing_network(monkeypatch, caplog, accuracies):
     accuracies["cohog"] = found(0.9)
     really = pick.make_technique
 
@@ -192,7 +192,7 @@ def test_list_preferred_begins_with_the_boards_own_technique():
     )
 
 
-def test_picked_technique_is_the_best_where_nothing_fits_and_the_log_says_why(monkeypatch, caplog):
+def test_pick_technique_returns_the_best_and_logs_why_if_nothing_fits(monkeypatch, caplog):
     slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
     monkeypatch.setattr(pick, "measure_costs", lambda technique: slow)
     for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):

@@ -64,7 +64,7 @@ def test_estimate_of_a_flight_on_the_board_itself_by_hand():
 
 
 @pytest.mark.usefixtures("on_board")
-def test_estimate_charges_no_rate_that_is_out_of_reach():
+def test_estimate_uses_no_rate_beyond_reach():
     fast = estimate(COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
     assert fast.option.misfit
@@ -85,7 +85,7 @@ def test_estimate_charges_no_rate_that_is_out_of_reach():
         ("thesis-xeon", "unknown", None, ("run `edgevpr profile` on the board", "The power of the thesis's server")),
     ],
 )
-def test_estimate_of_another_board_has_what_was_counted_and_says_so(board, times, recommended, notes):
+def test_estimate_of_another_board_uses_counted_instructions_and_reports_it(board, times, recommended, notes):
     estimated = estimate({"cohog": REGIONS, "vector": VECTOR}, board=load_board(board))
     assert (estimated.times, estimated.recommended) == (times, recommended)
     assert [row.option.label for row in estimated.techniques] == ["cohog"] * (times == "counted")
@@ -102,7 +102,7 @@ def test_estimate_on_the_board_itself_notes_unverified_power_alone():
 
 
 @pytest.mark.usefixtures("on_board")
-def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
+def test_estimate_recommends_the_most_accurate_that_fits_with_the_reason():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
     estimated = estimate(forms, board=replace(PI, technique=None))
     assert estimated.recommended == "cohog"

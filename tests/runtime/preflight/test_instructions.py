@@ -15,7 +15,7 @@ REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost
 PI = load_board("rpi-4b")
 
 
-def test_compute_costs_takes_counted_instructions_and_leaves_memory():
+def test_compute_costs_scales_counted_instructions_but_not_memory():
     work = count_work("cohog", {"camera": "nadir"})
     there = compute_costs(REGIONS, PI, work)
     parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
@@ -26,12 +26,12 @@ def test_compute_costs_takes_counted_instructions_and_leaves_memory():
     assert (there.ram_bytes_per_place, there.process_mb) == (1_000, 90.0)
 
 
-def test_compute_costs_knows_none_of_other_techniques_and_processors():
+def test_compute_costs_is_none_for_other_techniques_and_processors():
     assert compute_costs(REGIONS, PI, count_work("hog", {})) is None
     assert compute_costs(REGIONS, load_board("odroid-xu4"), count_work("cohog", {})) is None
 
 
-def test_counted_work_is_known_only_of_what_was_counted():
+def test_count_work_is_none_for_uncounted_settings():
     assert count_work("cohog", {}) == count_work("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
     assert count_work("cohog", {"w1": 256}) is None
     assert count_work("cohog", {"matching": "thesis"}) is None

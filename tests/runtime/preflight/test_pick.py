@@ -26,7 +26,7 @@ def recogniser(recording, clock):
         yield recogniser
 
 
-def test_measure_query_leaves_out_the_query_that_warms_up(recogniser, clock):
+def test_measure_query_excludes_the_warm_up_query(recogniser, clock):
     encode, seconds, shapes = recogniser.technique.encode, iter((6.0, 0.5)), []
 
     def work(image, mask):
@@ -39,7 +39,7 @@ def test_measure_query_leaves_out_the_query_that_warms_up(recogniser, clock):
     assert shapes == [(240, 320)] * 2
 
 
-def test_measure_query_tells_a_fault_and_a_refusal_from_a_time(recogniser):
+def test_measure_query_reports_faults_and_refusals(recogniser):
     refused = SimpleNamespace(judge=lambda image: SimpleNamespace(reason=Reason(ReasonCode.NOT_MEMORABLE)))
     recogniser.encoder = replace(recogniser.encoder, gate=refused)
     assert measure_query(recogniser, (320, 240)) is None
@@ -56,7 +56,7 @@ def test_describe_accuracy_is_of_the_technique_and_form(recogniser):
     ("board", "named", "chosen"),
     [("rpi-4b", None, "cohog"), ("rpi-4b", "hog", "hog"), ("odroid-xu4", None, "cohog"), ("odroid-xu4", "hog", "hog")],
 )
-def test_pick_technique_takes_one_of_unknown_cost_only_if_named_or_all_are(monkeypatch, board, named, chosen):
+def test_pick_technique_uses_unknown_costs_only_if_requested_or_all_are_unknown(monkeypatch, board, named, chosen):
     monkeypatch.setattr(pick, "measure_costs", lambda technique: REGIONS)
     monkeypatch.setattr(pick, "load_board", lambda name: replace(load_board(name), technique=named))
     monkeypatch.setattr(
@@ -65,7 +65,7 @@ def test_pick_technique_takes_one_of_unknown_cost_only_if_named_or_all_are(monke
     assert pick_technique(board, 100) == chosen
 
 
-def test_trusted_candidates_accepted_nothing_wrong(recording, monkeypatch):
+def test_list_safe_candidates_lists_only_counts_without_wrong_matches(recording, monkeypatch):
     config = load_config(None, {"map": str(recording / "cohog.gpkg")})
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:

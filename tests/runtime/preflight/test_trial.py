@@ -17,7 +17,7 @@ def die_of_hog(trials, threads):
 
 @pytest.mark.process
 @pytest.mark.usefixtures("models")
-def test_try_each_reports_a_process_that_dies_and_goes_on(monkeypatch):
+def test_run_trials_reports_a_process_that_dies_and_continues(monkeypatch):
     monkeypatch.setattr(trial, "_run_in_child", die_of_hog)
     found = list(run_trials([*list_trials(["hog"]), *list_trials(["seqslam"])], threads=1))
     assert [each.label for each in found] == ["hog", "seqslam"], "one row for all forms of what cannot be used"

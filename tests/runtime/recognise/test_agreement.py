@@ -51,7 +51,7 @@ def kept(image):
     ("right_px", "down_px", "rotation_deg", "scale"),
     [(80, 0, 0, 1.0), (0, -60, 0, 1.0), (40, 30, 30, 1.0), (-50, 20, 315, 1.15), (10, -40, 180, 0.85)],
 )
-def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, rotation_deg, scale):
+def test_measure_agreement_has_the_signs_of_a_cohog_match(landscape, right_px, down_px, rotation_deg, scale):
     """The query's middle lies right of the place's by `right_px`, and below it by `down_px`."""
     place = cut(landscape, 800, 600)
     query = cut(landscape, 800 + right_px, 600 + down_px, rotation_deg, scale)

@@ -90,7 +90,7 @@ def test_agreement_is_found_on_overlays_near_the_expected_one(way, expected, is_
     ],
 )
 @pytest.mark.parametrize("way", [{}, {"shift": 0.1, "rotation_deg": 90.0, "scale": 1.2}])
-def test_landmark_matches_one_of_a_plausible_place_direction_and_size(way, at, moved_by, angle_deg, size, matches):
+def test_landmark_matches_only_at_a_plausible_place_direction_and_size(way, at, moved_by, angle_deg, size, matches):
     query, place = laid(ring(10), **way)
     turn_scale = cmath.rect(way.get("scale", 1.0), math.radians(way.get("rotation_deg", 0.0)))
     more = landmarks([turn_scale * at + way.get("shift", 0.0) + moved_by], ANGLE_DEG + angle_deg, size, first=10)
@@ -99,7 +99,7 @@ def test_landmark_matches_one_of_a_plausible_place_direction_and_size(way, at, m
     assert measure_agreement(join(query, asked), join(place, more), expected).matched == 10 + matches
 
 
-def test_landmark_matches_one_whose_size_is_at_the_limit():
+def test_landmark_matches_at_the_limit_of_its_size():
     most = np.float32(1.35 * 1.2)
     for sizes in ((most, 1.0), (1.0, most)):
         query, place = laid(ring(10))
@@ -108,7 +108,7 @@ def test_landmark_matches_one_whose_size_is_at_the_limit():
 
 
 @pytest.mark.parametrize(("bits", "matches"), [(64, True), (65, False)])
-def test_landmark_matches_one_that_differs_in_a_quarter_of_its_bits(bits, matches):
+def test_landmark_matches_with_up_to_a_quarter_of_different_bits(bits, matches):
     query, place = laid(ring(10))
     flipped = np.unpackbits(query.bits[3])
     flipped[:bits] ^= 1
@@ -126,7 +126,7 @@ def test_landmark_is_an_inlier_within_the_tolerance(off, inliers):
     assert len(found.inlier_points[0]) == inliers
 
 
-def test_agreement_that_all_inliers_put_beyond_the_expected_overlays_is_none():
+def test_agreement_is_implausible_if_all_inliers_are_outside_the_expected_overlays():
     query, place = laid(ring(12), shift=0.1097)
     place.points[::2, 0] -= 0.004  # half of them alone lie near it
     place.points[1::2, 0] += 0.004
@@ -134,7 +134,7 @@ def test_agreement_that_all_inliers_put_beyond_the_expected_overlays_is_none():
 
 
 @pytest.mark.parametrize(("count", "inliers"), [(2, 0), (3, 3)])
-def test_three_landmarks_agree(count, inliers):
+def test_measure_agreement_accepts_three_landmarks(count, inliers):
     found = measure_agreement(*laid(ring(count)))
     assert (found.inliers, found.matched, found.possible) == (inliers, inliers, count)
 
@@ -148,7 +148,7 @@ def test_landmarks_on_one_spot_do_not_agree():
 
 
 @pytest.mark.parametrize(("middle", "off", "variance"), [(0.0, 0.0, 1.0), (0.0, 0.005, 2.0), (0.3, 0.005, 4.0)])
-def test_variance_grows_with_what_is_off_and_away_from_the_middle(middle, off, variance):
+def test_variance_grows_with_the_residuals_and_the_distance_from_the_centre(middle, off, variance):
     """Twelve landmarks whose errors no rotation, scale or shift takes out: of 24 coordinates four are fitted."""
     query, place = laid(ring(12, middle=middle + 0.05), shift=0.05)
     place.points[:, 0] += off * (-1.0) ** np.arange(12)
@@ -174,14 +174,14 @@ HIGHER = {"scale": 1.5}
         (4, 12, HIGHER, False),
     ],
 )
-def test_compare_near_returns_another_overlay_that_many_landmarks_prove(as_expected, otherwise, way, is_expected):
+def test_compare_near_returns_another_overlay_supported_by_many_landmarks(as_expected, otherwise, way, is_expected):
     pairs = laid(ring(as_expected, 0.1)), laid(ring(otherwise, 0.35), first=50, **way)
     found = compare_near(*(join(*each) for each in zip(*pairs, strict=True)), SAME)
     assert found.is_expected is is_expected
     assert found.inliers == (as_expected if is_expected else otherwise)
 
 
-def test_compare_near_takes_no_display_and_nothing_near_for_another_overlay():
+def test_compare_near_ignores_displays_and_nearby_overlays():
     still = laid(ring(20))
     assert compare_near(*still, Overlay((0.3, 0.0), 0.0, 1.0)).inliers == 0
     query, place = laid(ring(20), shift=0.05, rotation_deg=90.0)
@@ -205,7 +205,7 @@ def test_compare_near_takes_no_display_and_nothing_near_for_another_overlay():
         ((0.0, 0.0), 0.0, None, False),
     ],
 )
-def test_is_at_rest_without_shift_turn_or_scaling(shift, rotation_deg, scale, is_unshifted):
+def test_agreement_is_at_rest_without_shift_rotation_or_scaling(shift, rotation_deg, scale, is_unshifted):
     shown = {"shift_share": shift, "rotation_deg": rotation_deg, "scale": scale}
     assert Agreement(inliers=20, matched=20, possible=20, **shown).is_unshifted is is_unshifted
 

@@ -51,7 +51,7 @@ def is_at(posterior, place):
 
 
 @pytest.mark.parametrize("start", ["lost", "known"])
-def test_one_query_says_no_more_than_it_says_alone_where_it_fits_no_history(start):
+def test_update_gives_a_query_that_fits_no_history_its_own_confidence(start):
     rng, belief = np.random.default_rng(1), Belief(IN_ORDER)
     for n in range(10):
         belief.update(view_of_nothing(rng) if start == "lost" else view_of(10 + n, rng), STEP, PLACES)
@@ -59,7 +59,7 @@ def test_one_query_says_no_more_than_it_says_alone_where_it_fits_no_history(star
 
 
 @pytest.mark.parametrize("speed", [0.5, 1, 2, -0.5, -1, -2])
-def test_queries_that_fit_each_other_say_more_than_each_alone(speed):
+def test_update_gains_confidence_from_consistent_queries(speed):
     places = (20 if speed > 0 else 80) + speed * np.arange(25)
     posteriors = fly(Belief(IN_ORDER), places, np.random.default_rng(2))
     assert max(each.mass for each in posteriors) >= SURE
@@ -69,13 +69,13 @@ def test_queries_that_fit_each_other_say_more_than_each_alone(speed):
 
 
 @pytest.mark.parametrize("p", [0.3, 0.6, 0.9])
-def test_a_hover_over_what_looks_alike_says_what_one_look_says(p):
+def test_update_does_not_gain_confidence_in_a_hover_over_look_alikes(p):
     belief = Belief(IN_ORDER)
     masses = [belief.update(seen([50], [p]), STEP, PLACES).mass for _ in range(300)]
     assert max(masses) <= p + 1e-9
 
 
-def test_during_a_hover_the_newest_look_replaces_the_one_before():
+def test_update_replaces_the_previous_query_in_a_hover():
     belief = Belief(IN_ORDER)
     for p in (0.9, 0.2, 0.6):
         mass = belief.update(seen([50], [p]), STEP, PLACES).mass
@@ -85,7 +85,7 @@ def test_during_a_hover_the_newest_look_replaces_the_one_before():
 
 @pytest.mark.parametrize("p", [0.05, 0.2, 0.4])
 @pytest.mark.parametrize("places", [100, 10_000])
-def test_foreign_ground_that_is_a_little_like_the_map_all_the_way_is_not_believed(p, places):
+def test_update_refuses_foreign_ground_that_resembles_the_map_slightly(p, places):
     belief = Belief(IN_ORDER)
     masses = [belief.update(seen([10 + n], [p]), STEP, places).mass for n in range(80)]
     assert max(masses) < SURE
@@ -125,7 +125,7 @@ def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
     assert posteriors[-1].lost < 0.01
 
 
-def test_where_all_places_look_the_same_none_is_believed():
+def test_update_trusts_no_place_if_all_look_the_same():
     belief = Belief(IN_ORDER)
     for _ in range(60):
         posterior = belief.update(seen(np.arange(50), np.full(50, 0.98 / 50)), STEP, 50)
@@ -146,7 +146,7 @@ def some(rng, count, scale):
 
 @pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
 @pytest.mark.parametrize("places", [1, 1000, 10**6])
-def test_any_numbers_at_all_pass(ground, places):
+def test_update_accepts_any_numbers(ground, places):
     rng, belief = np.random.default_rng(places), Belief(ground)
     for _ in range(200):
         query = some(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
@@ -166,6 +166,6 @@ def test_any_numbers_at_all_pass(ground, places):
         *((2.0, velocity, None, 60.0) for velocity in (None, (np.nan, 1.0), (np.inf, 0.0), (61.0, 0.0))),
     ],
 )
-def test_limit_motion_uses_no_time_and_no_velocity_that_cannot_be(elapsed_s, velocity, by, reach):
+def test_limit_motion_ignores_implausible_times_and_velocities(elapsed_s, velocity, by, reach):
     motion = make_motion(elapsed_s, 30.0, velocity)
     assert (motion.displacement if by is None else tuple(motion.displacement), motion.reach) == (by, reach)

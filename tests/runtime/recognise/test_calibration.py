@@ -71,7 +71,7 @@ def flown(path):
         return recogniser.rule.confidence_rule.models
 
 
-def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
+def test_flight_uses_the_calibrated_models_of_its_map(path, caplog):
     assert flown(path) == SHIPPED
     keep(path, format_calibration(FOUND))
     assert flown(path) == {**SHIPPED, "ahead": OWN}, "an older edgevpr calibrated one of them"
@@ -104,7 +104,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("text", DAMAGED.values(), ids=DAMAGED)
-def test_with_a_damaged_calibration_the_shipped_model_flies_and_it_is_said(path, text, caplog):
+def test_flight_uses_the_default_model_and_reports_a_damaged_calibration(path, text, caplog):
     keep(path, text)
     with caplog.at_level(logging.WARNING):
         assert flown(path) == SHIPPED
@@ -114,7 +114,7 @@ def test_with_a_damaged_calibration_the_shipped_model_flies_and_it_is_said(path,
 
 
 @pytest.mark.parametrize("kind", MAP_FIGURES)
-def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
+def test_default_model_gives_a_probability_for_any_evidence(kind):
     model = read_shipped_model(kind)
     require_usable(kind, model)
     assert parse_model(json.loads(json.dumps(asdict(model)))) == model

@@ -26,14 +26,14 @@ def opened(models):
     return open_it
 
 
-def test_only_the_boxes_of_dynamic_classes_are_taken_out(opened):
+def test_is_static_masks_only_boxes_of_dynamic_classes(opened):
     static = opened([(16, 8, 32, 24, 2), (40, 40, 60, 60, 3)]).is_static(PICTURE)
     wanted = np.ones_like(static)
     wanted[16:48, 64:128] = False  # the picture is twice as high and four times as wide as the input
     assert np.array_equal(static, wanted)
 
 
-def test_a_padded_picture_has_its_boxes_where_they_are(opened):
+def test_is_static_places_boxes_correctly_in_a_padded_image(opened):
     static = opened([(16, 8, 32, 24, 0)], pad=114).is_static(PICTURE)  # 64 x 32 of the input show the picture
     wanted = np.ones_like(static)
     wanted[32:96, 64:128] = False
@@ -48,7 +48,7 @@ def test_a_padded_picture_has_its_boxes_where_they_are(opened):
         (np.zeros((1, 7, 9), np.float32), "not those of a `yolox` detector"),
     ],
 )
-def test_a_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, complaint):
+def test_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, complaint):
     with pytest.raises(ModelError, match=complaint) as refused:
         opened(raw=raw)
     assert "\n" not in str(refused.value)
@@ -61,7 +61,7 @@ def sigmoid(x):
     return 1 / (1 + math.exp(-x))
 
 
-def test_fastestdet_cell_by_cell():
+def test_detector_decodes_fastestdet_cell_by_cell():
     rows, columns, classes = 3, 5, 4
     raw = RNG.normal(0, 1, (1, 5 + classes, rows, columns)).astype(np.float32)
     raw[0, 0], raw[0, 5:] = RNG.random((rows, columns)), RNG.random((classes, rows, columns))

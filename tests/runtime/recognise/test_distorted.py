@@ -84,16 +84,16 @@ def off_m(map_path, camera, ground, **source):
 
 
 @pytest.mark.parametrize(("of", "by"), [("straight", "wide"), ("wide", "fisheye"), ("fisheye", "straight")])
-def test_every_camera_finds_its_position_in_every_cameras_map(maps, lenses, ground, of, by):
+def test_cameras_find_their_position_in_the_map_of_any_camera(maps, lenses, ground, of, by):
     assert max(off_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
 
 
-def test_without_its_calibration_positions_would_be_off(maps, ground):
+def test_positions_are_wrong_without_a_calibration(maps, ground):
     found = off_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
     assert max(each or math.inf for each in found) > 5.0
 
 
-def test_a_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
+def test_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
     with pytest.raises(UsageError, match=r"`source\.fov_deg` is 66"):
         off_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=66.0)
     assert off_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=SEEN_DEG["wide"])

@@ -56,7 +56,7 @@ def looked_down(matches, proof=None, same=(), tried=1.0):
     return gather_evidence(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, proof, same, looks_down=True)
 
 
-def test_evidence_has_the_names_that_models_ask_for():
+def test_evidence_has_the_features_of_the_models():
     down = {5: FineMatch(0.2, coverage=0.3)}
     for kind, evidence in (
         (AHEAD, looked_ahead({5: ahead(0.2)})),
@@ -69,7 +69,7 @@ def test_evidence_has_the_names_that_models_ask_for():
         assert evidence.describe().keys() <= ReasonCode.LOW_CONFIDENCE.parameters
 
 
-def test_gather_evidence_takes_the_next_place_for_a_rival_among_single_views():
+def test_gather_evidence_treats_the_next_single_view_as_a_rival():
     matches = {5: ahead(0.2), 6: ahead(0.19), 20: ahead(0.02)}
     along_a_way, single = (looked_ahead(matches, LookAlikes(overlap, {})) for overlap in (True, False))
     assert along_a_way.lead == looked_ahead(matches).lead > single.lead > 0
@@ -77,7 +77,7 @@ def test_gather_evidence_takes_the_next_place_for_a_rival_among_single_views():
 
 
 @pytest.mark.parametrize("overlap", [True, False])
-def test_gather_evidence_compares_with_what_looks_most_like_the_place(overlap):
+def test_gather_evidence_compares_with_the_most_similar_place(overlap):
     known = LookAlikes(overlap, {5: LookAlike(20, math.log(0.1), math.log(0.08)), 20: LookAlike(5, -3.0, -2.5)})
     of_twin, of_another = (looked_ahead({5: ahead(a), 20: ahead(b)}, known) for a, b in ((0.2, 0.1), (0.1, 0.2)))
     assert of_twin.twin == pytest.approx(math.log(0.1 / 0.08))
@@ -108,11 +108,11 @@ HARDLY_AHEAD = replace(AHEAD_OF_ALL, lead=math.log(1.49))
         (replace(HARDLY_AHEAD, likeness=None), False),
     ],
 )
-def test_needs_landmarks_where_regions_ahead_do_not_prove_a_match(evidence, needed):
+def test_needs_landmarks_if_forward_regions_are_not_sufficient(evidence, needed):
     assert evidence.needs_landmarks == needed
 
 
-def test_a_technique_has_the_kinds_of_its_camera():
+def test_list_evidence_kinds_depends_on_the_camera():
     assert list_evidence_kinds(create("cohog", {"w1": 208}).spec) == (AHEAD, AHEAD_PROVEN)
     assert list_evidence_kinds(create("cohog", {"camera": "nadir"}).spec) == (DOWN, DOWN_BARE)
     assert (
@@ -122,7 +122,7 @@ def test_a_technique_has_the_kinds_of_its_camera():
     )
 
 
-def test_the_lead_is_over_places_elsewhere_and_not_over_neighbours():
+def test_gather_evidence_measures_the_lead_over_places_elsewhere_not_neighbours():
     far, near = (looked_ahead({5: ahead(0.2), other: ahead(0.15)}) for other in (20, 6))
     assert far.lead == pytest.approx(math.log(math.sqrt(0.2 / 0.15)))
     assert near.lead > far.lead, "only chance is elsewhere"
@@ -149,12 +149,12 @@ def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_a
         (agreed(0), 0),
     ],
 )
-def test_landmarks_count_where_they_are_expected_and_have_moved(proof, counts):
+def test_landmarks_count_only_if_expected_and_shifted(proof, counts):
     evidence = looked_down({5: FineMatch(0.2, coverage=0.3)}, proof)
     assert evidence.landmarks == pytest.approx(math.log1p(counts))
 
 
-def test_a_place_of_the_same_ground_is_not_elsewhere():
+def test_gather_evidence_treats_a_place_of_the_same_ground_as_the_same_place():
     matches = {5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.19, coverage=0.3), 28: FineMatch(0.05, coverage=0.3)}
     index = type(INDEX)(**(dict(INDEX.arrays) | {"place_ids": np.arange(101, 131)}), mean=INDEX.mean)
     apart = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), looks_down=True)
@@ -163,20 +163,20 @@ def test_a_place_of_the_same_ground_is_not_elsewhere():
 
 
 @pytest.mark.parametrize("score", [0.0, 1e-9, 1.0])
-def test_no_share_makes_evidence_infinite(score):
+def test_gather_evidence_is_finite_for_any_fraction(score):
     matches = {5: ahead(score, back=0.0), 20: ahead(0.0, back=0.0)}
     assert all(map(math.isfinite, looked_ahead(matches).figures().values()))
     assert all(map(math.isfinite, looked_down({5: FineMatch(score), 20: FineMatch(0.0)}).figures().values()))
 
 
-def test_where_nothing_was_compared_there_is_no_evidence():
+def test_gather_evidence_is_none_if_nothing_was_compared():
     empty = Ranking(slots=np.array([3]), scores=np.array([0.2], np.float32), compared={})
     for down in (True, False):
         assert gather_evidence(empty, INDEX, NEIGHBOUR_M, None, (), looks_down=down) is None
     assert looked_ahead({5: FineMatch(0.2)}) is None, "a technique that gives no support"
 
 
-def test_a_model_of_other_evidence_cannot_be_used():
+def test_require_usable_refuses_a_model_of_other_evidence():
     model = read_shipped_model(DOWN_BARE)
     require_usable(DOWN, model)
     with pytest.raises(ValueError, match="landmarks"):
@@ -188,7 +188,7 @@ def test_a_model_of_other_evidence_cannot_be_used():
         require_usable(DOWN, replace(model, of_place=named))
 
 
-def test_with_a_known_heading_as_much_evidence_comes_less_often_by_chance():
+def test_chance_is_lower_with_a_known_heading():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
     all_of_them, known = (looked_down(matches, agreed(3), tried=tried).figures() for tried in (1.0, 1 / 8))
     model = read_shipped_model(DOWN)

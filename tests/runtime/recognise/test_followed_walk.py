@@ -70,7 +70,7 @@ def alone(whole_map, tmp_path):
         yield Walk(place_map, follows=False)
 
 
-def test_a_match_that_is_refused_alone_is_accepted_with_the_flight(flight, alone):
+def test_tracked_match_is_accepted_although_refused_alone(flight, alone):
     way = range(1, 19, STRIDE)
     alone_events, events = ([walk.see(place) for place in way] for walk in (alone, flight))
     assert not any(event.accepted for event in alone_events)
@@ -82,7 +82,7 @@ def test_a_match_that_is_refused_alone_is_accepted_with_the_flight(flight, alone
     assert events[0].position is None
 
 
-def test_a_match_that_contradicts_the_flight_is_refused_in_words(flight, alone):
+def test_tracked_match_that_contradicts_the_track_is_refused_with_a_reason(flight, alone):
     for place in range(1, 16, STRIDE):
         flight.see(place)
     assert alone.see(32, 0.9).accepted
@@ -93,7 +93,7 @@ def test_a_match_that_contradicts_the_flight_is_refused_in_words(flight, alone):
     assert flight.see(35, 0.9).accepted or flight.see(38, 0.9).accepted, "but not for long"
 
 
-def test_the_flight_knows_which_of_two_places_that_look_the_same_it_is(flight, alone):
+def test_tracked_flight_resolves_two_places_that_look_the_same(flight, alone):
     for place in range(24, 36, STRIDE):
         flight.see(place, 0.9)
     # By itself the place that comes first in the map is as good as the other.
@@ -108,7 +108,7 @@ def test_the_flight_knows_which_of_two_places_that_look_the_same_it_is(flight, a
         assert event.position.lat_deg == pytest.approx(50 + TWICE[1] * 0.0002)
 
 
-def test_an_aircraft_that_hovers_or_creeps_over_a_place_goes_on_recognising_it(whole_map):
+def test_tracked_hover_keeps_recognising_its_place(whole_map):
     """With the models that are shipped."""
     with PlaceMap.open(whole_map) as place_map:
         rule = make_accept_rule(TECHNIQUE, load_config(None).match)
@@ -118,7 +118,7 @@ def test_an_aircraft_that_hovers_or_creeps_over_a_place_goes_on_recognising_it(w
         assert all(creeping.see(5 + look // 4, elapsed_s=0.5).accepted for look in range(40))
 
 
-def test_pictures_that_say_nothing_or_cannot_be_used_do_not_lose_it(flight):
+def test_tracked_flight_survives_blank_and_unusable_images(flight):
     for place in range(1, 16, STRIDE):
         flight.see(place)
     flat = np.full((120, 160), 90, np.uint8)
@@ -128,7 +128,7 @@ def test_pictures_that_say_nothing_or_cannot_be_used_do_not_lose_it(flight):
     assert any(flight.see(place).accepted for place in (19, 22))
 
 
-def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map):
+def test_tracked_flight_accepts_no_unmapped_ground(whole_map):
     rule = sure_rule(lambda evidence: 0.89 if evidence["agree"] > math.log(0.6) else 0.05)
     with PlaceMap.open(whole_map) as place_map:
         walk = Walk(place_map, rule)

@@ -35,7 +35,7 @@ def walk(request, tmp_path_factory):
         yield recogniser
 
 
-def test_what_says_nothing_is_not_searched_for(walk):
+def test_step_does_not_search_images_without_information(walk):
     picture = np.full((480, 640, 3), (180, 0, 0), np.uint8)
     cv2.putText(picture, "NO SIGNAL", (150, 260), cv2.FONT_HERSHEY_SIMPLEX, 2, (255, 255, 255), 3)
     event = walk.step(frame(picture))
@@ -48,13 +48,13 @@ def test_what_says_nothing_is_not_searched_for(walk):
     assert (after.accepted, after.lacks_texture, after.best.place.source_image) == (True, False, "3.png")
 
 
-def test_no_picture_of_nothing_real_is_accepted(walk):
+def test_step_accepts_no_image_of_an_unreal_scene(walk):
     for kind, picture in pictures_of_nothing.pictures(seed=9000, count=23):
         event = walk.step(frame(picture, kind))
         assert not event.accepted, f"{kind}: {event.reason}"
 
 
-def test_a_picture_that_hides_most_of_a_place_is_that_place_or_none(walk):
+def test_step_accepts_only_the_correct_place_for_a_mostly_hidden_image(walk):
     recognised = 0
     for number in (2, 5):
         for kind, picture in pictures_of_nothing.spoilt(9000 + number, textured(number, 240, 320)):

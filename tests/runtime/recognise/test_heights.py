@@ -46,7 +46,7 @@ def recogniser(opened, monkeypatch, prior=None):
     return walk_over(place_map, technique, prior=prior), heights
 
 
-def test_one_look_is_enough_from_the_height_of_the_map(opened, monkeypatch):
+def test_step_needs_one_pass_at_the_height_of_the_map(opened, monkeypatch):
     walk, heights = recogniser(opened, monkeypatch)
     event = walk.step(frame(2))
     assert event.accepted
@@ -55,7 +55,7 @@ def test_one_look_is_enough_from_the_height_of_the_map(opened, monkeypatch):
 
 
 @pytest.mark.parametrize("height_ratio", [0.55, 2.0])
-def test_a_query_from_another_height_is_accepted_at_the_second_look(opened, monkeypatch, height_ratio):
+def test_step_accepts_a_query_from_another_height_in_the_second_pass(opened, monkeypatch, height_ratio):
     walk, heights = recogniser(opened, monkeypatch)
     event = walk.step(frame(1, height_ratio))
     assert heights == [1.0, 0.5, 0.7, 1.42, 2.0]
@@ -64,7 +64,7 @@ def test_a_query_from_another_height_is_accepted_at_the_second_look(opened, monk
     assert event.best.match.height_ratio == pytest.approx(height_ratio, rel=0.05)
 
 
-def test_in_a_flight_the_next_query_is_looked_for_from_the_same_height(opened, monkeypatch):
+def test_step_searches_the_next_query_at_the_last_height(opened, monkeypatch):
     walk, heights = recogniser(opened, monkeypatch, Prior(None, None, is_live=False))
     first, second = (walk.step(frame(place, 2.0)) for place in (1, 3))
     assert (first.accepted, second.accepted) == (True, True)
@@ -73,7 +73,7 @@ def test_in_a_flight_the_next_query_is_looked_for_from_the_same_height(opened, m
     assert second.view.zoom == pytest.approx(first.best.match.height_ratio / 2.0)
 
 
-def test_ground_that_is_not_in_the_map_is_accepted_from_no_height(opened, monkeypatch):
+def test_step_accepts_no_unmapped_ground_at_any_height(opened, monkeypatch):
     walk, _ = recogniser(opened, monkeypatch)
     for height_ratio in (0.5, 1.0, 2.0):
         event = walk.step(frame(17, height_ratio))
@@ -93,7 +93,7 @@ def cut_twice(tmp_path_factory):
 
 
 @pytest.mark.parametrize("height_m", [None, 100.0])
-def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_height(cut_twice, height_m):
+def test_step_searches_the_places_whose_footprint_fits_the_height(cut_twice, height_m):
     """By the height, where it is told, from the first picture on; else by the last match."""
     technique, place_map = cut_twice
     scan, looked = type(technique).score_places, []

@@ -62,7 +62,7 @@ def test_reach_grows_with_the_time_since_the_position_was_known(index):
     assert hints_at(10.0, index, heard_after_the_frame) == Hints(Reach(HOME, 55.0))
 
 
-def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old(index):
+def test_hints_prefer_a_fresh_autopilot_to_our_own_fix_and_both_grow_with_age(index):
     autopilot, fix = vehicle(north(200), 9.5), (0, 0.0)
     assert hints_at(10.0, index, autopilot, fix) == Hints(Reach(north(200), 55.0))
     assert hints_at(10.6, index, autopilot, fix) == Hints(Reach(HOME, pytest.approx(156.0)))
@@ -70,7 +70,7 @@ def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old(index):
     assert hints_at(10.0, index) is None
 
 
-def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
+def test_to_expectation_allows_only_places_in_reach_and_all_without_a_position(index):
     expected = to_expectation(Hints(Reach(north(120), 90.0)), 1.0, index)
     assert expected.in_reach.tolist() == [False, True, True, False, False]
     assert expected.rotation_deg is None
@@ -79,7 +79,7 @@ def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
     assert (everywhere.in_reach, everywhere.rotation_deg) == (None, None)
 
 
-def test_a_heading_says_how_far_each_place_is_turned_where_one_is_known(index):
+def test_to_expectation_gives_the_expected_rotation_of_each_place_if_the_heading_is_known(index):
     hints = hints_at(10.0, index, heading_deg=5.0)
     assert to_expectation(hints, 1.0, index).in_reach is None
     np.testing.assert_array_equal(to_expectation(hints, 1.0, index).rotation_deg, [5, 355, 345, np.nan, 15])
@@ -103,11 +103,11 @@ def test_a_heading_says_how_far_each_place_is_turned_where_one_is_known(index):
         (Hints(Reach(HOME, 100.0), 10.0), found(110, 10.0, 0.0), (False, True)),
     ],
 )
-def test_a_place_found_agrees_with_hints_that_would_have_led_to_it(hints, candidate, agrees):
+def test_agree_with_accepts_a_place_that_the_hints_would_have_allowed(hints, candidate, agrees):
     assert hints.agree_with(candidate, WITHIN_DEG) == agrees
 
 
-def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can_be_believed(index):
+def test_prior_alternates_with_and_without_hints_until_a_match_confirms_them(index):
     prior, near, seen = Prior(10.0, None, is_live=True), Position(50.0, 8.0), []
     answers = [(50, False), (50, False), (50, False), (50, True), (50, True), (500, True), (0, False)]
     for number, (metres, accepted) in enumerate(answers):
@@ -118,7 +118,7 @@ def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can
     assert seen == [True, False, True, False, True, True, False]
 
 
-def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_leaves_the_heading(index):
+def test_prior_keeps_the_area_with_a_wrong_compass_and_the_heading_with_a_wrong_position(index):
     prior, near, seen = Prior(10.0, WITHIN_DEG, is_live=True), Position(50.0, 8.0), []
     # Metres, and degrees against the compass, of a match; None: nothing is accepted.
     answers = [(50, 90.0), None, None, (50, 90.0), (500, 0.0), (500, 90.0), None, None, (50, 0.0), None]
@@ -132,7 +132,7 @@ def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_l
     assert seen == [both, area, None, area, area, heading, None, both, None, both]
 
 
-def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute():
+def test_prior_of_a_certain_flight_narrows_the_search_for_a_minute():
     long_index = index_of(100 * np.arange(40), [np.nan] * 40)
     prior, frame = Prior(None, None, is_live=True), Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=10.0)
     there = Located(position=north(2000), covariance_m2=(9.0, 0.0, 16.0))
@@ -149,7 +149,7 @@ def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute():
     assert prior.make_hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
 
-def test_the_next_picture_is_scaled_to_a_height_that_is_tried():
+def test_prior_scales_the_next_image_to_a_height_that_is_searched():
     prior, tried = Prior(None, WITHIN_DEG, is_live=True), (0.5, 0.7, 1.0, 1.42, 2.0)
 
     def learn(ratio, accepted=True):
@@ -168,7 +168,7 @@ def test_the_next_picture_is_scaled_to_a_height_that_is_tried():
     assert prior.scale(()) == 1.0
 
 
-def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights():
+def test_prior_searches_all_heights_every_second_query_over_unmapped_ground():
     prior = Prior(None, WITHIN_DEG, is_live=True)
     again = []
     for accepted in (False, False, False, True, True, False, False):

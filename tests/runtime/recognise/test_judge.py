@@ -45,7 +45,7 @@ DOUBTED = Located(position=Position(47.0, 8.0), covariance_m2=(1.0, 0.0, 1.0), o
 
 
 @pytest.mark.parametrize(("confidence", "accepted"), [(1.0, True), (NEEDED, True), (0.8999, False), (math.nan, False)])
-def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted):
+def test_judge_accepts_a_match_from_the_required_confidence(confidence, accepted):
     rule = sure_rule(lambda evidence: confidence)
     verdict = judged(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
@@ -61,19 +61,19 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
     ("confidence", "of_map", "lead", "is_undecided"),
     [(0.3, 0.5, 0.7, True), (NEEDED, 0.99, 0.7, False), (0.3, 0.49, 0.7, False), (0.3, 0.99, 0.0, False)],
 )
-def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_undecided):
+def test_judge_requests_more_evidence_only_if_it_can_decide(confidence, of_map, lead, is_undecided):
     rule = told(lambda evidence: confidence, lambda evidence: of_map)
     assert rule.is_undecided(replace(CLEAR, lead=lead)) == is_undecided
 
 
-def test_sureness_shows_no_more_than_the_data_support():
+def test_cap_confidence_shows_no_more_than_the_data_support():
     rule = ConfidenceRule(dict.fromkeys(MAP_FIGURES, Told(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
     assert (rule.confidence(CLEAR), rule.cap_confidence(CLEAR)) == (1.0, 0.9998)
     down = make_accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).confidence_rule
     assert down.cap_confidence(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
 
 
-def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by_the_flight():
+def test_judge_requires_landmarks_or_track_for_weak_forward_regions():
     rule = sure_rule(lambda evidence: 1.0, needed=0.9999)
     hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3)
     assert rule.confidence_rule.confidence(hardly) == 0.9
@@ -96,21 +96,21 @@ def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by
         (1.0, 0.49, False),
     ],
 )
-def test_a_flight_that_makes_a_place_much_likelier_needs_the_precision_only(confidence, followed, accepted):
+def test_judge_requires_only_the_precision_if_the_track_makes_the_place_much_likelier(confidence, followed, accepted):
     rule = sure_rule(lambda evidence: confidence, needed=0.9999)
     assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted == accepted
     assert judged(rule=rule, evidence=CLEAR).accepted is (confidence == 1.0)
 
 
 @pytest.mark.parametrize(("followed", "accepted"), [(0.99, True), (0.9899, False)])
-def test_a_flight_that_decides_is_sure_itself_however_little_is_asked(followed, accepted):
+def test_judge_requires_a_certain_track_if_the_track_decides(followed, accepted):
     rule = sure_rule(lambda evidence: 0.5)
     rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))
     assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted is accepted
 
 
 @pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.ROTATION_AMBIGUOUS)])
-def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
+def test_judge_requires_a_lead_over_the_image_at_another_rotation(lead, code):
     verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_other_rotation=lead)
     assert verdict.reason.code is (code or ReasonCode.ACCEPTED_BY_CONFIDENCE)
 
@@ -123,7 +123,7 @@ def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
         ({"located": DOUBTED}, ReasonCode.LOW_TEXTURE),
     ],
 )
-def test_a_match_is_refused_by_its_tilt_and_its_position(known, code):
+def test_judge_refuses_a_match_for_its_tilt_and_its_position(known, code):
     verdict = judged(**known)
     assert verdict.reason.code is code
     assert verdict.accepted is (code is ReasonCode.ACCEPTED_BY_SCORE)
@@ -141,19 +141,19 @@ def test_a_match_is_refused_by_its_tilt_and_its_position(known, code):
         ((0.25, 0.125), {"min_score": 0.0}, ReasonCode.ACCEPTED_BY_SCORE),
     ],
 )
-def test_limits_are_met_by_what_equals_them(scores, limits, code):
+def test_judge_accepts_values_equal_to_the_limits(scores, limits, code):
     verdict = judged(scores, replace(RULE, **limits))
     assert verdict.reason.code is code
     assert verdict.accepted is code.name.startswith("ACCEPTED")
 
 
 @pytest.mark.parametrize(("quality", "needed"), [(0.3, None), (0.29, 0.3), (math.nan, 0.3)])
-def test_says_nothing_of_a_picture_of_enough_quality(quality, needed):
+def test_check_texture_accepts_an_image_of_sufficient_quality(quality, needed):
     reason = check_texture(SimpleNamespace(quality=quality), 0.3)
     assert (reason and reason.parameters["min_share"]) == needed
 
 
-def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
+def test_judge_accepts_the_place_of_the_track_over_the_best_score():
     rule = make_accept_rule(create("cohog"), load_config(None, {}).match)
     rule = replace(rule, confidence_rule=told(lambda evidence: 0.5))
     assert judged((0.19, 0.2), rule, evidence=CLEAR, track_confidence=0.9999).accepted
@@ -162,31 +162,31 @@ def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
 
 
 @pytest.mark.parametrize(("lead", "accepted"), [(0.0, True), (-0.01, False)])
-def test_no_flight_makes_sure_what_a_place_elsewhere_beats_in_the_same_picture(lead, accepted):
+def test_judge_refuses_by_track_alone_what_another_place_beats_in_the_image(lead, accepted):
     rule = sure_rule(lambda evidence: 0.5)
     verdict = judged(rule=rule, evidence=replace(CLEAR, lead=lead), track_confidence=0.9999)
     assert verdict.accepted is accepted
     assert (verdict.reason.code is ReasonCode.ELSEWHERE_AGREES_BETTER) is not accepted
 
 
-def test_a_match_that_offers_no_evidence_is_never_sure():
+def test_judge_refuses_a_match_without_evidence():
     assert not judged(rule=sure_rule(lambda evidence: 1.0)).accepted
 
 
 @pytest.mark.parametrize("limit", [{"min_score": 0.21}, {"min_margin": 0.11}, {"min_verify_score": 0.21}])
-def test_limits_come_on_top_of_a_confidence(limit):
+def test_judge_applies_limits_in_addition_to_the_confidence(limit):
     assert judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR).accepted
     assert not judged(rule=sure_rule(lambda evidence: 1.0, **limit), evidence=CLEAR).accepted
 
 
 @pytest.mark.parametrize("score", [math.nan, 0.019])
-def test_a_score_that_says_nothing_makes_up_for_no_confidence(score):
+def test_judge_does_not_compensate_low_confidence_with_a_high_score(score):
     assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, min_verify_score=0.02), evidence=CLEAR).accepted
 
 
 @pytest.mark.parametrize("kind", [DOWN, DOWN_BARE])
 @pytest.mark.parametrize("precision", [0.5, 0.999])
-def test_a_place_that_is_not_ahead_of_one_elsewhere_is_never_sure(kind, precision):
+def test_confidence_is_low_without_a_lead_over_other_places(kind, precision):
     """Whatever the shipped models say."""
     config = load_config(None, {"match.accept_precision": precision}).match
     rule = make_accept_rule(create("cohog", {"camera": "nadir"}), config).confidence_rule
@@ -194,7 +194,7 @@ def test_a_place_that_is_not_ahead_of_one_elsewhere_is_never_sure(kind, precisio
     assert rule.confidence(evidence) <= 0.5 < rule.threshold(evidence)
 
 
-def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
+def test_make_accept_rule_uses_limits_for_sequences_and_techniques_without_evidence():
     config = load_config(None).match
     by_confidence, technique = make_accept_rule(create("cohog", {"w1": 208}), config), create("cohog")
     assert by_confidence.confidence_rule
@@ -204,7 +204,7 @@ def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
     assert make_accept_rule(create("hog"), config).confidence_rule is None
 
 
-def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_with():
+def test_judge_refuses_a_sequence_whose_newest_query_was_not_compared_with_the_place():
     search = SimpleNamespace(frames=2, length=2)
     ranking = Ranking(slots=np.array([0, 10]), scores=np.array([0.2, 0.1], np.float32), compared={10: FineMatch(0.1)})
     verdict = judge(Findings(ranking), bare_index(30), RULE, search)
@@ -212,7 +212,7 @@ def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_wit
 
 
 @pytest.mark.parametrize(("rival", "accepted"), [(0.25, True), (0.26, False)])
-def test_a_sequence_leads_over_those_at_other_speeds_by_half_the_margin(rival, accepted):
+def test_judge_requires_a_sequence_to_lead_over_other_speeds_by_half_the_margin(rival, accepted):
     rivals = np.zeros(30, np.float32)
     rivals[10] = rival
     search = SimpleNamespace(frames=2, length=2, rivals=rivals, is_continued=lambda near, least: True)
@@ -223,7 +223,7 @@ def test_a_sequence_leads_over_those_at_other_speeds_by_half_the_margin(rival, a
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (0.4, True), (4 / 9, False)])
-def test_where_places_elsewhere_have_not_moved_either_all_share_a_display(share, accepted):
+def test_judge_refuses_unshifted_matches_of_other_places_as_an_overlay(share, accepted):
     verdict = judged(unshifted_fraction=share)
     assert verdict.accepted is accepted
     assert (verdict.reason.code is ReasonCode.ELSEWHERE_AT_REST) is not accepted
@@ -241,7 +241,7 @@ def test_where_places_elsewhere_have_not_moved_either_all_share_a_display(share,
         ((0.0, 0.0), None, None, False),
     ],
 )
-def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation_deg, height_ratio, expected):
+def test_is_at_rest_requires_no_shift_rotation_or_height_change(shift_cells, rotation_deg, height_ratio, expected):
     match = FineMatch(0.3, shift_cells=shift_cells, rotation_deg=rotation_deg, height_ratio=height_ratio)
     assert is_unshifted(match) is expected
 
@@ -250,7 +250,7 @@ def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation
     ("lead", "inliers", "rival", "accepted"),
     [(0.1, 20, 10, True), (0.1, 20, 11, False), (0.1, 20, 0, True), (0.1, 0, 0, True)],
 )
-def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
+def test_judge_requires_landmarks_against_a_place_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
     evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
     verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), agreement=agreed(inliers), evidence=evidence)
@@ -275,7 +275,7 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
         (0.12, agreed(30, is_expected=False), False),
     ],
 )
-def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, accepted):
+def test_judge_refuses_a_clear_vote_without_agreeing_landmarks(score, proof, accepted):
     assert judged((score, score - 0.1), agreement=proof).accepted == accepted
 
 
@@ -304,7 +304,7 @@ def flown(velocity, start, leaves=18, seed=3):
 
 
 @pytest.mark.parametrize("velocity", [0.8, 1.2])
-def test_a_flight_like_the_mapping_flight_is_accepted_from_the_first_full_sequence_on(velocity):
+def test_sequence_of_the_mapping_flight_is_accepted_from_the_first_complete_one(velocity):
     found = flown(velocity, 5)
     assert [yes for yes, _, _ in found] == [False] * (LENGTH - 1) + [True] * (18 - LENGTH + 1)
     assert all(abs(slot - (5 + velocity * query)) <= 1 for query, (yes, _, slot) in enumerate(found) if yes)
@@ -312,13 +312,13 @@ def test_a_flight_like_the_mapping_flight_is_accepted_from_the_first_full_sequen
 
 
 @pytest.mark.parametrize(("velocity", "start"), [(2.0, 5), (3.0, 5), (0.0, 30), (0.3, 30), (-1.0, 60), (-2.0, 60)])
-def test_at_another_speed_or_the_other_way_nothing_wrong_is_accepted(velocity, start):
+def test_sequence_at_another_speed_or_direction_is_never_accepted_wrongly(velocity, start):
     for query, (yes, _, slot) in enumerate(flown(velocity, start)):
         assert not yes or abs(slot - (start + velocity * query)) <= 2  # neighbours are no other place
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
+def test_sequence_ends_where_the_aircraft_leaves_the_mapped_route(seed):
     found = flown(1.0, 5, leaves=11, seed=seed)
     assert found[10][0]
     # The mean would bear it for some queries yet: it is far ahead of all other places.
@@ -326,7 +326,7 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
     assert any(code is ReasonCode.NEWEST_ELSEWHERE for _, code, _ in found[11:14])
 
 
-def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number():
+def test_make_accept_rule_divides_the_margin_by_the_root_of_the_sequence_length():
     technique, config = create("hog"), load_config(None).match
     assert make_accept_rule(technique, config, 9).min_margin == pytest.approx(technique.min_margin / math.sqrt(9))
     assert make_accept_rule(technique, config).min_margin == technique.min_margin

@@ -19,7 +19,7 @@ def ground():
     return textured(1, 480, 640)
 
 
-def test_they_are_spread_over_the_picture_and_lie_about_its_middle(ground):
+def test_detect_landmarks_spreads_them_over_the_image_around_its_centre(ground):
     found = detect_landmarks(ground)
     assert 100 < len(found) <= PLACE_LANDMARKS < len(detect_landmarks(ground, count=QUERY_LANDMARKS))
     assert (np.abs(found.points) <= (0.5, 0.375)).all()
@@ -29,14 +29,14 @@ def test_they_are_spread_over_the_picture_and_lie_about_its_middle(ground):
     assert len(np.unique(np.rint(at_px / 3), axis=0)) == len(found), "a corner counts once, on whatever level"
 
 
-def test_the_number_of_pixels_of_a_camera_does_not_matter(ground):
+def test_detect_landmarks_is_independent_of_the_camera_resolution(ground):
     small = detect_landmarks(np.ascontiguousarray(ground.repeat(2, axis=0).repeat(2, axis=1)))
     one = {tuple(point) for point in np.rint(detect_landmarks(ground).points * 100).tolist()}
     other = {tuple(point) for point in np.rint(small.points * 100).tolist()}
     assert len(one & other) > 0.6 * len(one)
 
 
-def test_none_touches_what_the_mask_leaves_out(ground):
+def test_detect_landmarks_avoids_masked_pixels(ground):
     mask = np.ones(ground.shape, bool)
     mask[:, 300:] = False
     found = detect_landmarks(ground, mask)
@@ -44,7 +44,7 @@ def test_none_touches_what_the_mask_leaves_out(ground):
     assert found.points[:, 0].max() * 640 + 319.5 < 300 - 15
 
 
-def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
+def test_unpack_bytes_reverses_pack_bytes_within_the_size_of_a_place(ground):
     found = detect_landmarks(ground)
     blob = pack_bytes(found)
     assert len(blob) <= MAX_LANDMARK_BYTES
@@ -66,7 +66,7 @@ def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
     ],
     ids=["empty", "short header", "cut", "longer", "newer form"],
 )
-def test_what_is_damaged_is_said_to_be(ground, spoil):
+def test_unpack_bytes_refuses_damaged_landmarks(ground, spoil):
     with pytest.raises(ValueError, match="its landmarks"):
         unpack_bytes(spoil(pack_bytes(detect_landmarks(ground))))
 
@@ -82,6 +82,6 @@ def test_what_is_damaged_is_said_to_be(ground, spoil):
     ],
     ids=["one pixel", "a line", "tiny", "flat", "black"],
 )
-def test_a_picture_without_corners_has_none(image):
+def test_detect_landmarks_finds_none_without_corners(image):
     found = detect_landmarks(image)
     assert (len(found), found.points.shape, found.bits.shape) == (0, (0, 2), (0, 32))

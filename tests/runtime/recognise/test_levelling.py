@@ -93,7 +93,7 @@ HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
 
 
 @pytest.mark.slow
-def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, ground):
+def test_step_finds_the_place_from_another_height_heading_and_tilt(walk, ground):
     as_it_is = walk(None).step(frame(ground, 1, **HARD))
     event = walk(scaling()).step(frame(ground, 1, **HARD))
     assert recognised(event, 1)
@@ -114,7 +114,7 @@ def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, grou
         {"heading_deg": None, "roll_deg": None, "pitch_deg": None, "height_m": None},
     ],
 )
-def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong):
+def test_step_finds_a_level_image_whatever_attitude_is_reported(walk, ground, wrong):
     event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | wrong))
     assert not event.failed
     assert recognised(event, 2)
@@ -122,7 +122,7 @@ def test_a_straight_picture_is_found_whatever_is_told_of_it(walk, ground, wrong)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pitch_deg", [30.0, 45.0, 52.0])
-def test_a_steep_picture_of_known_angles_gives_the_position_of_the_aircraft(walk, ground, pitch_deg):
+def test_step_locates_the_aircraft_from_a_steep_image_of_known_angles(walk, ground, pitch_deg):
     steep = frame(ground, 2, pitch_deg=pitch_deg)
     event = walk(scaling()).step(steep)
     assert recognised(event, 2)
@@ -131,7 +131,7 @@ def test_a_steep_picture_of_known_angles_gives_the_position_of_the_aircraft(walk
 
 
 @pytest.mark.slow
-def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
+def test_prepare_warps_the_mask_with_the_image(walk, ground):
     seen = frame(ground, 1, heading_deg=180.0)
     image = seen.image.copy()
     image[:120, :160] = np.random.default_rng(1).integers(0, 256, (120, 160, 3))
@@ -144,7 +144,7 @@ def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
 
 
 @pytest.mark.slow
-def test_a_tilt_that_a_picture_does_not_bear_is_refused_and_said_once(walk, ground, caplog):
+def test_prepare_refuses_too_large_a_tilt_and_reports_it_once(walk, ground, caplog):
     asked = walk(scaling())
     steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 65.0})
     with caplog.at_level(logging.WARNING):
@@ -156,7 +156,7 @@ def test_a_tilt_that_a_picture_does_not_bear_is_refused_and_said_once(walk, grou
     assert [record.message for record in caplog.records] == [f"1: {reasons[0]} (further frames are not reported)"]
 
 
-def test_a_place_has_the_position_of_the_middle_of_its_picture():
+def test_centre_place_has_the_position_of_the_image_centre():
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0, 300.0))
     east = centre_place(
         at, View(up_deg=90.0, footprint_m=100.0, nadir_offset=(0.0, -0.3))
@@ -170,7 +170,7 @@ def test_a_place_has_the_position_of_the_middle_of_its_picture():
 
 
 @pytest.mark.parametrize("view", [View(), View(up_deg=0.0), View(footprint_m=50.0, nadir_offset=(0.1, 0.1))])
-def test_without_height_or_heading_a_place_has_no_pose(view):
+def test_centre_place_has_no_pose_without_height_or_heading(view):
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0), heading_deg=70.0)
     found = centre_place(at, view)
     assert (found.pose, found.position) == (None, at.position)
@@ -186,7 +186,7 @@ def test_without_height_or_heading_a_place_has_no_pose(view):
         ("forward", {"source.fov_deg": 66.0}, type(None)),
     ],
 )
-def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, settings, kind, caplog):
+def test_make_levelling_requires_a_downward_camera_with_a_known_lens(camera, settings, kind, caplog):
     config = load_config(None, settings)
     with caplog.at_level(logging.INFO):
         made = make_levelling(config.source, create("cohog", {"camera": camera}))
@@ -196,7 +196,7 @@ def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 215.0])
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (20.0, 0.0), (0.0, -15.0), (-15.0, 10.0)])
-def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitch_deg, heading_deg):
+def test_prepare_reports_the_tilt_of_an_image_without_a_lens(roll_deg, pitch_deg, heading_deg):
     how = {"heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
     pose = CameraPose(east_m=0.0, north_m=0.0, height_m=80.0, **how)
     camera = Camera()
@@ -212,13 +212,13 @@ def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitc
     assert Levelling(None, is_live=False).prepare(replace(frame, **told), None, None).view == view, "a recording's own"
 
 
-def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_nothing_is_known():
+def test_prepare_reports_too_large_a_tilt_and_no_view_without_a_heading():
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0, roll_deg=50.0, pitch_deg=0.0)
     assert Levelling(None, is_live=False).prepare(frame, None, None).view.reason.code is ReasonCode.TILTED
     assert Levelling(None, is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
 
 
-def test_a_gimbal_keeps_the_camera_level_whatever_the_airframe_does():
+def test_prepare_ignores_the_attitude_with_a_gimbal():
     frame = Frame(image=np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8), name="", t_mono_s=5.0)
     told = {"heading_deg": 30.0, "height_m": 80.0}
     banked, level = (vehicle_at(50.0, 8.0, 5.0, roll_deg=roll, pitch_deg=5.0 * roll, **told) for roll in (9.0, 0.0))
@@ -229,7 +229,7 @@ def test_a_gimbal_keeps_the_camera_level_whatever_the_airframe_does():
 
 
 @pytest.mark.parametrize("fov_deg", [LENS.fov_deg, None])
-def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_gimbal(technique, fov_deg):
+def test_prepare_applies_the_configured_mount_with_and_without_lens_or_gimbal(technique, fov_deg):
     """Of a camera that looks 9 degrees ahead, the point under it is 16 m behind what it shows."""
     said = {"source.fov_deg": fov_deg, "source.uri": "/dev/video0", "source.mount_ahead_deg": 9.0}
     for gimbal in (False, True):
@@ -243,7 +243,7 @@ def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("heading_deg", [0.0, 130.0])
-def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_without(walk, ground, heading_deg):
+def test_step_locates_a_tilted_camera_correctly_only_with_its_mount(walk, ground, heading_deg):
     seen = frame(ground, 1, heading_deg=heading_deg, pitch_deg=9.0, told=STRAIGHT | {"heading_deg": heading_deg})
     ahead_m = HEIGHT_M * math.tan(math.radians(9))
     turn = math.radians(heading_deg)
@@ -265,7 +265,7 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
     ("pitch_deg", "reported_deg"),
     [(12.0, None), (20.0, None), (40.0, None), (60.0, None), (20.0, 0.0), (40.0, 0.0), (60.0, 0.0)],
 )
-def test_a_view_of_unreported_tilt_claims_no_more_than_it_knows(walk, ground, pitch_deg, reported_deg):
+def test_step_claims_an_unreported_tilt(walk, ground, pitch_deg, reported_deg):
     told = STRAIGHT | {"roll_deg": reported_deg, "pitch_deg": reported_deg}
     event = walk(scaling()).step(frame(ground, 1, pitch_deg=pitch_deg, told=told))
     ahead_m = HEIGHT_M * math.tan(math.radians(pitch_deg))
@@ -274,7 +274,7 @@ def test_a_view_of_unreported_tilt_claims_no_more_than_it_knows(walk, ground, pi
 
 
 @pytest.mark.slow
-def test_a_view_that_is_level_needs_no_report_of_it(walk, ground):
+def test_step_needs_no_attitude_for_a_level_image(walk, ground):
     event = walk(scaling()).step(frame(ground, 1, told=STRAIGHT | {"roll_deg": None, "pitch_deg": None}))
     assert recognised(event, 1)
     assert event.accuracy_m < 10
@@ -282,7 +282,7 @@ def test_a_view_that_is_level_needs_no_report_of_it(walk, ground):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.7, 1.3])
-def test_a_recorded_height_that_is_wrong_is_corrected_by_the_first_match(walk, ground, factor):
+def test_step_corrects_a_wrong_recorded_height_after_the_first_match(walk, ground, factor):
     prior = RecordedPrior(("height",))
     recogniser = walk(scaling(), prior)
     told = STRAIGHT | {"height_m": factor * HEIGHT_M}
@@ -294,7 +294,7 @@ def test_a_recorded_height_that_is_wrong_is_corrected_by_the_first_match(walk, g
 
 
 @pytest.mark.parametrize("lens", [LENS, None])
-def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, ground, technique, lens):
+def test_step_corrects_a_wrong_reported_height_after_the_first_match(walk, ground, technique, lens):
     levelling = Levelling(lens, is_live=False)
     follow = walk(levelling, Prior(None, technique.spec.heading_within_deg, is_live=False))
     told = STRAIGHT | {"height_m": 1.25 * HEIGHT_M}
@@ -314,7 +314,7 @@ def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, gro
 
 
 @pytest.mark.parametrize("zoom", [0.5, 2.0])
-def test_a_picture_is_enlarged_around_its_middle(zoom):
+def test_enlarge_image_scales_around_the_centre(zoom):
     image = np.zeros((81, 121), np.uint8)
     image[40, 60] = image[40, 60 + 12] = 255
     picture = enlarge_image(LevelledImage(image, None, UNKNOWN_VIEW), zoom)

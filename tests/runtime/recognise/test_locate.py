@@ -45,14 +45,14 @@ def off_m(position):
         ((4, 0), 45, (8 / math.sqrt(2), -8 / math.sqrt(2))),
     ],
 )
-def test_a_step_in_the_picture_is_one_on_the_ground(shift, up_deg, there):
+def test_locate_converts_a_shift_in_the_image_to_the_ground(shift, up_deg, there):
     found = locate([candidate(shift=shift, up_deg=up_deg)], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
     assert found.position.alt_m == ORIGIN.alt_m
 
 
 @pytest.mark.parametrize(("up_deg", "turned_deg", "heading_deg"), [(0, 0, 0), (90, 30, 120), (300, 90, 30)])
-def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg, heading_deg):
+def test_locate_adds_the_rotation_to_the_heading_of_the_place(up_deg, turned_deg, heading_deg):
     found = locate([candidate(up_deg=up_deg, turned_deg=turned_deg)], CELLS)
     assert found.heading_deg == pytest.approx(heading_deg)
 
@@ -66,19 +66,19 @@ def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg,
         (90, (0.25, 0.0), (0, -16)),
     ],
 )
-def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_deg, nadir_offset, there):
+def test_locate_gives_the_position_of_the_aircraft_not_of_the_image_centre(turned_deg, nadir_offset, there):
     found = locate([candidate(turned_deg=turned_deg)], CELLS, View(nadir_offset=nadir_offset))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
 
 
-def test_what_is_aside_of_a_query_from_higher_up_is_farther():
+def test_locate_scales_the_nadir_offset_with_the_height():
     proof = agreed(20, (0.0, 0.0), scale=2.0)
     found = locate([candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
-def test_landmarks_are_heard_before_the_vote():
+def test_locate_prefers_landmarks_to_the_vote():
     proof = agreed(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
     by_vote = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)))
     found = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)), proof)
@@ -90,7 +90,7 @@ def test_landmarks_are_heard_before_the_vote():
     assert found.accuracy_m < by_vote.accuracy_m
 
 
-def test_places_of_the_same_ground_are_heard_together():
+def test_locate_averages_places_of_the_same_ground():
     one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
     found = locate([one, other], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
@@ -100,12 +100,12 @@ def test_places_of_the_same_ground_are_heard_together():
     assert found.objection is None
 
 
-def test_places_that_contradict_each_other_are_refused():
+def test_locate_refuses_contradicting_places():
     found = locate([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.objection.code is ReasonCode.POSITIONS_DISAGREE
 
 
-def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
+def test_locate_skips_a_slightly_inconsistent_place_without_objection():
     candidates = [candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)]
     found = locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.places == (1,)
@@ -120,12 +120,12 @@ def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
         candidate(2, shift=(0, 0), east_m=400),  # other ground
     ],
 )
-def test_what_does_not_show_the_same_ground_is_not_heard(other):
+def test_locate_skips_places_of_other_ground(other):
     found = locate([candidate(1, shift=(4, 0)), other], CELLS)
     assert (found.places, found.objection) == ((1,), None)
 
 
-def test_without_a_pose_or_a_step_there_is_nothing_to_say():
+def test_locate_needs_a_pose_and_a_shift():
     bare = Place(place_id=1, source_image="1", position=ORIGIN)
     assert locate([Candidate(bare, candidate().match)], CELLS) is None
     assert locate([Candidate(candidate().place, FineMatch(0.5))], CELLS) is None
@@ -133,7 +133,7 @@ def test_without_a_pose_or_a_step_there_is_nothing_to_say():
     assert locate_at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
 
 
-def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
+def test_locate_rotates_the_covariance_of_the_place_to_the_ground():
     found = locate([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(nadir_offset=(0.0, 0.0)))
     var_east, cov, var_north = found.covariance_m2
     assert var_east > 100 > 10 > var_north > 1

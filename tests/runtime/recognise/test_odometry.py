@@ -43,7 +43,7 @@ def stride(first, second, after_s=1.0):
         {"east_m": 210.0, "height_m": 110.0},
     ],
 )
-def test_it_is_the_way_that_the_aircraft_has_gone(ground, change):
+def test_odometry_measures_the_displacement_of_the_aircraft(ground, change):
     second = replace(START, **change)
     found = stride(seen(ground, START), seen(ground, second))
     gone_m = second.east_m - START.east_m, second.north_m - START.north_m
@@ -52,7 +52,7 @@ def test_it_is_the_way_that_the_aircraft_has_gone(ground, change):
     assert found.sd_m < 0.5
 
 
-def test_a_wrong_height_stretches_it_and_a_wrong_compass_turns_it(ground):
+def test_odometry_is_scaled_by_a_wrong_height_and_rotated_by_a_wrong_compass(ground):
     second = replace(START, east_m=230.0)
     low, turned = ({"height_m": 90.0}, {"heading_deg": 40.0})
     pair = [seen(ground, pose, replace(pose, **low)) for pose in (START, second)]
@@ -62,7 +62,7 @@ def test_a_wrong_height_stretches_it_and_a_wrong_compass_turns_it(ground):
     assert math.degrees(math.atan2(-north, east)) == pytest.approx(10.0, abs=1.0)
 
 
-def test_where_it_cannot_be_told_there_is_none(ground):
+def test_odometry_is_none_if_it_cannot_be_measured(ground):
     first, second = seen(ground, START), seen(ground, replace(START, east_m=215.0))
     elsewhere = seen(ground, replace(START, east_m=60.0, north_m=330.0))
     assert stride(first, elsewhere) is None
@@ -72,13 +72,13 @@ def test_where_it_cannot_be_told_there_is_none(ground):
     assert stride(first, (replace(second[0], footprint_m=None), second[1])) is None
 
 
-def test_a_compass_or_a_height_that_jumps_is_not_believed(ground):
+def test_odometry_rejects_jumps_of_compass_and_height(ground):
     second = replace(START, east_m=215.0)
     for wrong in ({"heading_deg": 50.0}, {"height_m": 70.0}):
         assert stride(seen(ground, START), seen(ground, second, replace(second, **wrong))) is None
 
 
-def test_ground_that_repeats_or_says_nothing_gives_none():
+def test_odometry_is_none_over_repetitive_or_featureless_ground():
     rng = np.random.default_rng(2)
     tile = cv2.GaussianBlur(rng.uniform(0, 255, (40, 40)).astype(np.float32), (0, 0), 2)
     tile = cv2.normalize(tile, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)

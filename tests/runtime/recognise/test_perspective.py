@@ -35,7 +35,7 @@ def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, 
 
 @pytest.mark.parametrize(("turned_deg", "scale"), [(0.0, 1.0), (70.0, 1.2), (200.0, 0.8)])
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(2.0, 0.0), (0.0, -3.0), (-1.0, 1.5)])
-def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg, turned_deg, scale):
+def test_fit_attitude_error_moves_the_nadir_opposite_to_the_tilt(roll_deg, pitch_deg, turned_deg, scale):
     """Right wing down, the middle of the picture is to the left: the aircraft is right of it."""
     asked, known = landmarks(roll_deg=roll_deg, pitch_deg=pitch_deg, turned_deg=turned_deg, scale=scale)
     lean = fit_attitude_error(asked, known, SEEN, up_deg=turned_deg)
@@ -45,7 +45,7 @@ def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg,
     assert lean.sd == pytest.approx(math.tan(math.radians(0.5)), rel=0.2)  # of the place's picture
 
 
-def test_it_is_as_exact_as_it_says():
+def test_fit_attitude_error_is_as_accurate_as_it_reports():
     seen = (landmarks(roll_deg=2.0, noise=2 / 640, count=count) for count in (30, 60, 120, 240))
     told = [fit_attitude_error(*each, SEEN, 0.0) for each in seen]
     for lean in told:
@@ -54,14 +54,14 @@ def test_it_is_as_exact_as_it_says():
     assert all(later.sd < before.sd for before, later in pairwise(told))
 
 
-def test_the_point_under_the_camera_may_be_beside_the_middle():
+def test_fit_attitude_error_accepts_a_nadir_away_from_the_centre():
     nadir_offset = (0.2, -0.1)
     view = View(nadir_offset=nadir_offset, focal=FOCAL)
     lean = fit_attitude_error(*landmarks(roll_deg=2.0, nadir_offset=nadir_offset), view, 0.0)
     assert lean.nadir_shift == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
 
 
-def test_a_slope_of_the_ground_is_no_tilt():
+def test_fit_attitude_error_ignores_a_slope_of_the_ground():
     """Seen from 15 m beside the place at 100 m, a slope of ten degrees shears the picture by some 3 %."""
     asked, known = landmarks(count=60, noise=2 / 640)
     beside = asked.real > -0.1  # the pictures overlap on one side only
@@ -71,11 +71,11 @@ def test_a_slope_of_the_ground_is_no_tilt():
 
 
 @pytest.mark.parametrize("view", [View(), View(nadir_offset=(0.0, 0.0)), View(focal=FOCAL)])
-def test_without_attitude_or_lens_nothing_is_said(view):
+def test_fit_attitude_error_needs_attitude_and_lens(view):
     assert fit_attitude_error(*landmarks(roll_deg=2.0), view, 0.0) is None
 
 
-def test_few_landmarks_or_those_on_a_line_say_nothing():
+def test_fit_attitude_error_needs_enough_landmarks_off_a_line():
     asked, known = landmarks(count=11)
     assert fit_attitude_error(asked, known, SEEN, 0.0) is None
     line = np.linspace(-0.4, 0.4, 20) + 0j

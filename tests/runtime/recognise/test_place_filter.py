@@ -139,7 +139,7 @@ def made_map(path, has_poses):
 
 
 @pytest.mark.parametrize("p", [0.01, 0.5, 0.9, 0.9999])
-def test_the_first_look_is_believed_as_it_stands(flight, p):
+def test_place_filter_uses_the_first_query_unchanged(flight, p):
     followed = flight.look(20, p)
     assert followed.slot == 20
     assert followed.confidence == pytest.approx(p)
@@ -147,7 +147,7 @@ def test_the_first_look_is_believed_as_it_stands(flight, p):
     assert not followed.prefers_other(20)
 
 
-def test_what_the_best_place_leaves_is_shared_by_the_others(flight):
+def test_place_filter_shares_the_remaining_probability_among_other_places(flight):
     followed = flight.look(20, 0.1, of_map=0.9, others=(40,))
     assert followed.slot == 40
     assert 0.1 < followed.confidence < 0.8, "it may be none of those that were compared"
@@ -171,7 +171,7 @@ def test_positions_are_those_of_the_places(posed_map, bare_map):
     assert found.estimate.sd_m > SPACING_M / 4, "a place says no better where the aircraft is than it is apart"
 
 
-def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
+def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(posed_map):
     where = Located(position=at(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
     slots = np.array([20, 40])
     ranking = Ranking(
@@ -185,7 +185,7 @@ def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
 
 
 @pytest.mark.parametrize("t_utc_s", [None, float("nan")])
-def test_a_recording_without_times_is_followed_too(flight, t_utc_s):
+def test_place_filter_tracks_a_recording_without_times(flight, t_utc_s):
     follower = flight.follower = PlaceFilter(flight.place_map, max_speed_m_s=None, is_live=False)
     for place in range(10, 70, STRIDE):
         follower.predict(Frame(image=NOTHING, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
@@ -195,7 +195,7 @@ def test_a_recording_without_times_is_followed_too(flight, t_utc_s):
     assert followed.confidence > 0.95
 
 
-def test_of_two_looks_at_one_frame_only_the_last_is_kept(flight):
+def test_place_filter_keeps_only_the_last_pass_of_a_frame(flight):
     other = Flight(flight.place_map, flight.index)
     for each in (flight, other):
         each.over(range(10, 40, STRIDE))
@@ -206,7 +206,7 @@ def test_of_two_looks_at_one_frame_only_the_last_is_kept(flight):
     assert flight.look(43) == other.look(43)
 
 
-def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, bare_map):
+def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_map, bare_map):
     some = index_of([None if place % 3 == 0 else at(place) for place in range(PLACES)])
     for place_map in (posed_map, bare_map):
         flight = Flight(place_map, some)
@@ -232,7 +232,7 @@ def after_a_gap(place_map, moved_m, away=60, p=0.5):
     return flight, flight.look(9, p=p, moved_m=moved_m)
 
 
-def test_what_the_camera_sees_of_the_motion_makes_a_doubtful_match_sure(posed_map):
+def test_place_filter_confirms_a_doubtful_match_by_odometry(posed_map):
     _, blind = after_a_gap(posed_map, None)
     _, seen = after_a_gap(posed_map, along(1))
     assert blind.confidence < 0.9  # of a match that is right half the time
@@ -240,7 +240,7 @@ def test_what_the_camera_sees_of_the_motion_makes_a_doubtful_match_sure(posed_ma
     assert off_m(seen, 9) < SPACING_M
 
 
-def test_queries_that_find_nothing_over_the_same_ground_are_one(posed_map):
+def test_place_filter_counts_failed_queries_over_the_same_ground_once(posed_map):
     flight = Flight(posed_map, IN_METRES)
     for place in range(6):
         flight.look(place, moved_m=along(1))
@@ -249,7 +249,7 @@ def test_queries_that_find_nothing_over_the_same_ground_are_one(posed_map):
 
 
 @pytest.mark.parametrize("moved_m", [None, along(1)])
-def test_a_belief_that_is_wrong_costs_queries_and_not_the_flight(posed_map, moved_m):
+def test_place_filter_recovers_from_a_wrong_belief(posed_map, moved_m):
     """Carried off by half the map, while the camera sees nothing of it, or sees a motion that is not the aircraft's."""
     flight, _ = after_a_gap(posed_map, moved_m)
     found = [flight.look(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]
@@ -258,7 +258,7 @@ def test_a_belief_that_is_wrong_costs_queries_and_not_the_flight(posed_map, move
     assert off_m(found[-1], 65) < SPACING_M
 
 
-def test_of_twins_none_becomes_sure_however_often_the_same_one_looks_best(posed_map):
+def test_place_filter_never_confirms_one_of_several_twins(posed_map):
     flight = Flight(posed_map, IN_METRES)
     for place in range(20, 60, STRIDE):
         followed = flight.look(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)

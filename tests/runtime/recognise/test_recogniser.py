@@ -41,7 +41,7 @@ def walk(whole_map, tmp_path, clock):
         yield walk_over(place_map, create("cohog", {"w1": 208}), RULE, clock=clock, settings=settings)
 
 
-def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
+def test_step_returns_a_complete_event_for_a_recognised_place(walk):
     event = walk.step(frame(3, 12.5))
     assert event.accepted
     assert not event.failed
@@ -55,7 +55,7 @@ def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
     assert event.descriptor.fine is not None
 
 
-def test_every_step_is_metered(walk, clock):
+def test_step_meters_each_step(walk, clock):
     encode, scan, match = walk.technique.encode, walk.technique.score_places, walk.technique.match
     walk.technique.encode = lambda *asked: (clock.work(0.010), encode(*asked))[1]
     walk.technique.score_places = lambda *asked: (clock.work(0.020, 2.0), scan(*asked))[1]
@@ -76,7 +76,7 @@ class Wrong(Exception):
     "error", [ModelError("no."), MapError("gone."), Wrong("x"), MemoryError(), ZeroDivisionError()]
 )
 @pytest.mark.parametrize("where", ["encode", "score_places", "match"])
-def test_whatever_a_technique_raises_is_a_refusal_with_its_reason(walk, error, where):
+def test_step_refuses_with_the_reason_of_any_exception_of_a_technique(walk, error, where):
     def broken(*asked, **more):
         raise error
 
@@ -92,7 +92,7 @@ def test_whatever_a_technique_raises_is_a_refusal_with_its_reason(walk, error, w
     assert walk.step(frame(1)).accepted, "the next frame is recognised"
 
 
-def test_a_stop_is_no_exception_of_a_frame(walk):
+def test_step_lets_a_stop_pass(walk):
     class Stop(BaseException):
         pass
 
@@ -104,13 +104,13 @@ def test_a_stop_is_no_exception_of_a_frame(walk):
         walk.step(frame(1))
 
 
-def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
+def test_report_unread_returns_an_event_for_an_unreadable_frame(walk):
     event = walk.report_unread(ValueError("cut"))
     assert (event.frame, event.failed, event.is_query) == (None, True, False)
     assert event.reason == Reason(ReasonCode.UNEXPECTED_ERROR, {"error": "ValueError", "problem": "cut"})
 
 
-def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
+def test_recogniser_never_claims_better_than_the_minimum_accuracy(walk):
     walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
     settings = MatchSettings(min_accuracy_m=20.0)
     dense = Recogniser(walk.encoder, walk.place_map, walk.matcher, walk.meter, settings=settings)
@@ -118,7 +118,7 @@ def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     assert load_config(None).mavlink.min_accuracy_m == 5.0
 
 
-def test_the_rivals_of_a_place_do_not_show_its_ground(tmp_path):
+def test_step_ignores_places_of_the_same_ground_as_rivals(tmp_path):
     """A place 60 m on is beyond `neighbour_m`, and half of its ground is the same."""
     technique, ground, side_px = create("cohog", {"camera": "nadir"}), textured(9, 256, 2048), 256
     pose = Pose(up_deg=0.0, footprint_m=128.0, covariance_m2=(1.0, 0.0, 1.0))

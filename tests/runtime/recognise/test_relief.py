@@ -17,7 +17,7 @@ def relief_of(ratios, is_one_place=False):
 
 
 @pytest.mark.parametrize("reported", [1.0, 0.4])
-def test_relief_is_the_scatter_of_heights_whatever_height_is_reported(reported):
+def test_relief_is_the_scatter_of_heights_at_any_reported_height(reported):
     rng = np.random.default_rng(1)
     flat, hills = (relief_of(reported * np.exp(rng.normal(0, sd, 80))) for sd in (0.01, 0.2))
     assert flat.height_sd < 0.05

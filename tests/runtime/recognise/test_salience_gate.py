@@ -66,17 +66,17 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
         (asked(0, 0, 0), None),
     ],
 )
-def test_all_criteria_that_are_on_must_hold(thresholds, lacks):
+def test_judge_scores_requires_all_enabled_criteria(thresholds, lacks):
     worth = judge_scores(Salience(0.5, 0.9, 0.5), thresholds)
     assert worth.criterion == lacks
     assert (worth.reason is None) == (lacks is None) == (worth.shortfall == 0)
 
 
-def test_a_score_that_was_not_looked_at_is_not_asked_for():
+def test_judge_scores_ignores_a_score_that_was_not_computed():
     assert judge_scores(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
 
 
-def test_in_bad_light_less_entropy_is_asked_for():
+def test_salience_gate_requires_less_entropy_in_bad_light():
     day = [texture() for _ in range(40)]
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
     by_day, at_night = SalienceGate(asked(entropy=0.4)), SalienceGate(asked(entropy=0.4))
@@ -86,7 +86,7 @@ def test_in_bad_light_less_entropy_is_asked_for():
     assert at_night.judge(np.full((120, 160), 3, np.uint8)).criterion == "entropy"
 
 
-def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
+def test_salience_gate_halves_the_threshold_until_the_light_is_known():
     gate = SalienceGate(asked(entropy=0.4))
     little = texture()
     while not 0.2 < compute_scores(little).entropy < 0.4:
@@ -95,7 +95,7 @@ def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
     assert all(gate.judge(np.full((120, 160), 3, np.uint8)).criterion == "entropy" for _ in range(3))
 
 
-def test_a_long_stretch_without_information_does_not_become_usual():
+def test_salience_gate_does_not_adapt_to_a_long_stretch_without_information():
     gate = SalienceGate(asked(entropy=0.4))
     for _ in range(30):
         assert gate.judge(texture()).reason is None
@@ -103,7 +103,7 @@ def test_a_long_stretch_without_information_does_not_become_usual():
     assert all(gate.judge(empty).criterion == "entropy" for _ in range(70))
 
 
-def test_the_detector_looks_at_every_kth_frame_only():
+def test_salience_gate_runs_the_detector_on_every_kth_frame():
     class Counting:
         looks = 0
 
@@ -141,7 +141,7 @@ def kept(gaps, events):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_no_gap_is_longer_than_the_bound_in_frames(seed):
+def test_place_selector_limits_gaps_in_frames(seed):
     rng = np.random.default_rng(seed)
     events = [event(number, 0.0 if rng.random() < 0.02 else rng.uniform(0.001, 0.4)) for number in range(500)]
     numbers = [number for number, _ in kept(PlaceSelector(20), events)]
@@ -151,7 +151,7 @@ def test_no_gap_is_longer_than_the_bound_in_frames(seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_no_gap_is_longer_than_the_bound_in_metres(seed):
+def test_place_selector_limits_gaps_in_metres(seed):
     rng = np.random.default_rng(seed)
     where_m = np.cumsum(rng.uniform(1, 9, 300))
     events = [event(number, rng.uniform(0.001, 0.4), where) for number, where in enumerate(where_m)]
@@ -159,7 +159,7 @@ def test_no_gap_is_longer_than_the_bound_in_metres(seed):
     assert max(np.diff([where_m[0], *places_m])) <= 40.01
 
 
-def test_the_best_of_a_gap_are_those_that_pass_after_the_fewest_steps_and_are_marked():
+def test_place_selector_marks_the_best_frames_kept_to_limit_a_gap():
     events = [event(0), *(event(number, 0.2) for number in range(1, 21))]
     events[7], events[12] = event(7, 0.07), event(12, 0.08)
     assert kept(PlaceSelector(20), [*events, event(21, 0.2)]) == [(0, False), (7, True), (12, True)]

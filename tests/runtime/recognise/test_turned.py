@@ -38,19 +38,19 @@ def walk(turned_walk):
     return turned_walk(prior=RecordedPrior(("heading",), WITHIN_DEG))
 
 
-def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):
+def test_step_accepts_a_rotationally_ambiguous_place_only_with_a_heading(walk):
     unknown, known = (walk.step(frame(LIKE_A_BRIDGE, 40, heading_deg)) for heading_deg in (None, 0.0))
     assert not unknown.accepted
     assert unknown.reason.code is ReasonCode.ROTATION_AMBIGUOUS
     assert known.accepted, known.reason
 
 
-def test_any_other_place_is_accepted_without(walk):
+def test_step_accepts_any_other_place_without_a_heading(walk):
     event = walk.step(frame(1, 40))
     assert event.accepted, event.reason
 
 
-def test_a_wrong_compass_costs_one_query_and_not_the_flight(turned_walk):
+def test_step_loses_one_query_to_a_wrong_compass(turned_walk):
     """The next finds its place without the heading, as do the others until a place is found that agrees with it."""
     walk = turned_walk(prior=Prior(None, WITHIN_DEG, is_live=False))
     headings_deg = {0: 0.0, 1: 150.0, 3: 150.0}

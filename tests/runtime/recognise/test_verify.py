@@ -74,7 +74,7 @@ def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
         return [walk.step(query) for _ in range(times)][-1]
 
 
-def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, technique):
+def test_verify_finds_the_landmarks_of_a_downward_map(mapped, technique):
     event = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.accepted
     assert event.reason.parameters["landmarks"] == event.agreement.inliers
@@ -105,14 +105,14 @@ def proof_of(path, confidence, of_map=1.0, moved_px=(10, -16)):
     return event.evidence.proof
 
 
-def test_looking_ahead_landmarks_count_where_a_match_is_not_sure_without_them(mapped_ahead):
+def test_verify_uses_landmarks_of_a_forward_camera_if_the_match_is_uncertain(mapped_ahead):
     assert proof_of(mapped_ahead, 0.5) > math.log(2)
     assert proof_of(mapped_ahead, 0.95) == 0, "it is sure"
     assert proof_of(mapped_ahead, 0.5, of_map=0.1) == 0, "they would not tell that it is on the map"
     assert proof_of(mapped_ahead, 0.5, moved_px=(0, 0)) == 0, "a display drawn over every picture agrees as well"
 
 
-def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, technique):
+def test_verify_refuses_a_clear_match_with_landmarks_of_another_image(mapped, technique):
     others = pack_bytes(detect_landmarks(frame(77).image))
     keep(mapped, others, zlib.crc32(others))
     event = asked(mapped, technique, frame(1, 20, -10))
@@ -122,7 +122,7 @@ def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, 
     assert asked(mapped, technique, frame(2, 20, -10)).accepted, "the other places are as they were"
 
 
-def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mapped, technique):
+def test_verify_refuses_a_place_whose_landmarks_and_regions_disagree(mapped, technique):
     turned = pack_bytes(detect_landmarks(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
     keep(mapped, turned, zlib.crc32(turned))
     event = asked(mapped, technique, frame(1, 20, -10))
@@ -134,7 +134,7 @@ def behind_figures(image):
     return figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
 
 
-def test_of_a_picture_at_rest_places_elsewhere_tell_whether_there_is_a_display(tmp_path, mapped, technique):
+def test_verify_detects_an_overlay_by_unshifted_matches_of_other_places(tmp_path, mapped, technique):
     anything = sure_rule(lambda evidence: 1.0)
     drawn = [replace(frame(place), image=behind_figures(frame(place).image)) for place in range(PLACES)]
     path = map_of(tmp_path / "drawn.gpkg", technique, drawn)
@@ -152,14 +152,14 @@ def far(image):
     return Frame(image=image, name="again.png", t_mono_s=0.0, position=Position(51.0, 8.0))
 
 
-def test_ground_that_is_in_the_map_twice_is_an_even_chance_at_best(tmp_path, technique):
+def test_verify_gives_ground_mapped_twice_at_most_an_even_chance(tmp_path, technique):
     path = map_of(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(frame(1).image)])
     event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert (event.accepted, event.confidence) == (False, 0.5)
 
 
 @pytest.mark.parametrize("has_landmarks", [True, False])
-def test_ground_that_is_in_the_map_nearly_twice_is_not_accepted_for_its_landmarks(tmp_path, technique, has_landmarks):
+def test_verify_does_not_accept_nearly_duplicate_ground_by_landmarks(tmp_path, technique, has_landmarks):
     """A place elsewhere without landmarks may be the right one as well."""
     changed = frame(1).image.copy()
     changed[:, :80] = frame(9).image[:, :80]
@@ -193,7 +193,7 @@ def same_ground(path, technique, query):
         return event, int(walk.index.place_ids[event.ranking.slots[0]]), set(looked.find_same_ground(event.ranking))
 
 
-def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, technique):
+def test_verify_treats_overlapping_places_without_positions_as_the_same_ground(overlapping, technique):
     for query in (bare(1, 3, 2), bare(1, -15, 5)):
         event, best, same = same_ground(overlapping, technique, query)
         assert {best, *same} == {1, 5, 8}
@@ -204,7 +204,7 @@ def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, 
 @pytest.mark.parametrize(
     "blob", [None, b"", b"\x09of a newer form", pack_bytes(detect_landmarks(np.zeros((9, 9), np.uint8)))]
 )
-def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
+def test_verify_judges_a_place_without_landmarks_as_before(mapped, technique, blob):
     without = asked(mapped, technique, frame(1, 20, -10), verify=False)
     keep(mapped, blob, None if blob is None else zlib.crc32(blob))
     event = asked(mapped, technique, frame(1, 20, -10))
@@ -214,7 +214,7 @@ def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
     assert "landmarks" not in to_fields(without)
 
 
-def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, technique):
+def test_verify_refuses_damaged_landmarks_and_leaves_the_place_out(mapped, technique):
     keep(mapped, b"damaged", 1)
     event = asked(mapped, technique, frame(1, 20, -10))
     assert (event.accepted, event.failed, event.map_lost) == (False, True, False)
@@ -225,7 +225,7 @@ def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, techn
     assert again.reason.code in (ReasonCode.PLACE_UNREAD, ReasonCode.LOW_SCORE)
 
 
-def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
+def test_verify_applies_the_mask_to_landmarks(whole, technique, tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:, :160] = False
     path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], mask=OverlayMask(allowed, "half"))
@@ -235,5 +235,5 @@ def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
     assert there.points[:, 0].min() > 0
 
 
-def test_a_sequence_is_not_compared_by_landmarks(mapped, technique):
+def test_verify_skips_landmarks_of_a_sequence(mapped, technique):
     assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).agreement is None

@@ -45,7 +45,7 @@ def is_the_same(log, **how):
     return again, lines
 
 
-def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
+def test_replay_of_an_ardupilot_flight_is_identical(fly, tmp_path):
     with simulated_autopilot() as (link, _):
         ended(fly("--link", link, *QUICK))
     again, lines = is_the_same(tmp_path / "flight.jsonl")
@@ -57,14 +57,14 @@ def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
     assert again.packets.alike >= sum(sent.values()) > PLACES, "every packet was compared"
 
 
-def test_a_flight_with_a_px4_is_the_same_to_the_byte(fly, tmp_path):
+def test_replay_of_a_px4_flight_is_identical(fly, tmp_path):
     with simulated_autopilot(vehicle="px4-plane") as (link, _):
         ended(fly("--link", link, "--rate-hz", "8"))
     again, _ = is_the_same(tmp_path / "flight.jsonl")
     assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0
 
 
-def test_a_flight_goes_on_when_its_terminal_closes_and_a_signal_that_ends_it_is_replayed(fly, tmp_path):
+def test_replay_includes_signals_and_a_closed_terminal(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
     with simulated_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "5")
@@ -77,7 +77,7 @@ def test_a_flight_goes_on_when_its_terminal_closes_and_a_signal_that_ends_it_is_
     assert again.why_ended is None
 
 
-def test_a_flight_by_the_times_of_its_pictures_is_the_same(fly, recording, tmp_path):
+def test_replay_of_a_flight_timed_by_its_images_is_identical(fly, recording, tmp_path):
     rows = []
     for number in range(6):
         picture = f"{number}.png"
@@ -90,7 +90,7 @@ def test_a_flight_by_the_times_of_its_pictures_is_the_same(fly, recording, tmp_p
     assert len(of_kind(again.lines, "query")) == 6
 
 
-def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_path):
+def test_replay_of_a_killed_flight_ends_with_its_tape(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
     with simulated_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "10")
@@ -108,7 +108,7 @@ def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_pa
         assert len(shorter.lines) <= len(again.lines)
 
 
-def test_signed_packets_are_the_same_but_for_the_signature(fly, tmp_path):
+def test_replay_ignores_only_the_signature_of_signed_packets(fly, tmp_path):
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))
     key.chmod(0o600)
@@ -130,7 +130,7 @@ def test_signed_packets_are_the_same_but_for_the_signature(fly, tmp_path):
     assert bytes(range(32)).hex() not in tape
 
 
-def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_path, monkeypatch, capsys):
+def test_replay_reports_a_different_answer_of_a_technique(fly, tmp_path, monkeypatch, capsys):
     ended(fly(*QUICK))
     log = str(tmp_path / "flight.jsonl")
     assert main(["replay", log]) == 0
@@ -143,7 +143,7 @@ def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_pat
     assert len(found["lines"]["others"]) == PLACES
 
 
-def test_what_is_missing_is_said(fly, recording, tmp_path, capsys):
+def test_replay_reports_missing_files(fly, recording, tmp_path, capsys):
     log = tmp_path / "flight.jsonl"
     assert "There is no flight log" in refused(capsys, "replay", log)
     ended(start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--rate-hz", "60"))

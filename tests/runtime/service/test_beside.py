@@ -61,7 +61,7 @@ def mavproxy(put, folder):
         pytest.param(mavproxy, "MAVProxy owns it", False, id="MAVProxy"),
     ],
 )
-def test_run_behind_a_router_that_is_killed_in_flight(recording, tmp_path, owner, section, is_shown):
+def test_run_survives_a_router_killed_in_flight(recording, tmp_path, owner, section, is_shown):
     cable, log = SerialCable(tmp_path), tmp_path / "flight.jsonl"
     with ExitStack() as stack:
         station_port = stack.enter_context(closing(UdpPort()))

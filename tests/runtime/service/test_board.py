@@ -60,7 +60,7 @@ def test_check_machine_finds_a_full_disk(root, monkeypatch):
     assert find(root)["log"].reason.code is FindingCode.DISK_FULL
 
 
-def test_check_device_accepts_a_serial_port_that_is_free():
+def test_check_device_accepts_a_free_serial_port():
     controller, port = os.openpty()
     assert check_device("serial", os.ttyname(port)).ok
     os.close(controller)

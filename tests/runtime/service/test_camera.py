@@ -60,7 +60,7 @@ def test_check_camera_finds_a_device_of_the_ribbon_without_access(root, monkeypa
 
 
 @pytest.mark.parametrize("uri", ["rpicam", "gst: v4l2src ! appsink"])
-def test_check_camera_finds_that_the_program_is_missing(root, monkeypatch, uri):
+def test_check_camera_finds_a_missing_program(root, monkeypatch, uri):
     monkeypatch.setenv("PATH", str(root))
     (finding,) = check_camera(uri, root)
     assert (finding.ok, finding.reason.code) == (False, ReasonCode.UNUSABLE)

@@ -70,7 +70,7 @@ def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(setting
 
 
 @pytest.mark.parametrize(("board", "is_other"), [("this", False), ("thesis-xeon", True)])
-def test_check_says_if_a_query_was_not_measured_on_the_board(settings, config_file, board, is_other):
+def test_check_reports_a_query_time_not_measured_on_the_board(settings, config_file, board, is_other):
     config_file.write_text(yaml.safe_dump(settings | {"board": board}))
     (finding,) = (each for each in check_configuration(config_file, offline=True) if each.what == "map")
     assert finding.reason.parameters["t_query_s"] > 0
@@ -89,14 +89,14 @@ def test_check_opens_the_signing_key(settings, config_file, tmp_path):
     assert finding.what == "link"
 
 
-def test_check_leaves_nothing_behind(settings, config_file, tmp_path, flight_folder):
+def test_check_leaves_no_files(settings, config_file, tmp_path, flight_folder):
     assert wrong(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]
     assert sorted(path.name for path in flight_folder.iterdir()) == ["images", "valley.gpkg"]
 
 
 @pytest.mark.parametrize("text", ["map: [", "mapp: valley.gpkg", "source: {rate_hz: 1000}", "\x00", "- 1", None])
-def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
+def test_check_stops_at_an_unreadable_configuration(config_file, text):
     if text is not None:
         config_file.write_text(text)
     (finding,) = check_configuration(config_file)
@@ -121,7 +121,7 @@ def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
         ({"log": {"path": "/absent/flight.jsonl"}}, ["log"]),
     ],
 )
-def test_check_finds_what_is_wrong_offline(settings, config_file, changes, wrong_things):
+def test_check_finds_faults_offline(settings, config_file, changes, wrong_things):
     assert [finding.what for finding in wrong(config_file, settings | changes)] == wrong_things
 
 
@@ -171,14 +171,14 @@ def test_check_finds_another_autopilot_than_the_configured(settings, config_file
     assert (finding.reason.code, finding.reason.parameters["systems"]) == (FindingCode.OTHER_SYSTEM, "4")
 
 
-def test_check_finds_a_camera_that_does_not_deliver(settings, config_file):
+def test_check_finds_a_camera_without_frames(settings, config_file):
     settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port()}/camera"
     settings["mavlink"]["link"] = None
     (finding,) = wrong_online(config_file, settings)
     assert (finding.what, finding.reason.code) == ("source", FindingCode.NO_FRAME)
 
 
-def test_check_takes_no_damaged_image_for_a_frame(settings, config_file, tmp_path):
+def test_check_does_not_count_a_damaged_image_as_a_frame(settings, config_file, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     (folder / "1.png").write_bytes(b"no picture")

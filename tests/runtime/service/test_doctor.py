@@ -74,7 +74,7 @@ MUTE = replace(COPTER, answers=False, version=None, parameters={}, received=(), 
 SIGNED = replace(MUTE, signs=True, signs_requests=True)
 
 
-def test_check_autopilot_finds_nothing_wrong_with_a_copter_and_a_px4_that_are_set_up():
+def test_check_autopilot_accepts_a_configured_copter_and_px4():
     assert wrong(COPTER) == wrong(PX4) == {}
 
 
@@ -89,7 +89,7 @@ def test_check_autopilot_finds_nothing_wrong_with_a_copter_and_a_px4_that_are_se
         ("copter", {"FLOW_TYPE": 6, "EK3_SRC2_VELXY": 5}),
     ],
 )
-def test_check_autopilot_accepts_what_carries_the_position(vehicle, parameters):
+def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
     assert wrong(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)) == {}
 
 
@@ -97,7 +97,7 @@ def test_check_autopilot_accepts_what_carries_the_position(vehicle, parameters):
 @pytest.mark.parametrize(
     "parameters", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
 )
-def test_check_autopilot_wants_a_second_receiver_where_nothing_carries_the_position(vehicle, parameters):
+def test_check_autopilot_requires_a_second_receiver_without_another_source(vehicle, parameters):
     found = wrong(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
     assert found == {"channel": ("GPS2_TYPE=14",)}
     assert wrong(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
@@ -153,7 +153,7 @@ def test_check_autopilot_finds_each_fault_alone(change, what, changes):
     assert wrong(replace(COPTER, **change)) == {what: changes}
 
 
-def test_check_autopilot_accepts_what_is_unknown():
+def test_check_autopilot_accepts_unknown_values():
     assert wrong(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
 
 
@@ -163,7 +163,7 @@ def test_check_autopilot_wants_a_faster_line():
     assert wrong(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
 
 
-def test_check_autopilot_finds_only_the_link_where_nothing_answers():
+def test_check_autopilot_reports_only_the_link_without_an_answer():
     assert set(wrong(MUTE)) == set(wrong(SIGNED)) == {"link"}
     assert set(wrong(replace(MUTE, signs=True))) == {"link", "signing"}
     assert wrong(replace(COPTER, signs=True)) == {}
@@ -184,7 +184,7 @@ def test_check_autopilot_wants_no_second_receiver_for_a_dry_run(vehicle):
         ({"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}, "VISO_TYPE=0"),
     ],
 )
-def test_check_autopilot_finds_what_keeps_a_dry_run_from_arming(parameters, change):
+def test_check_autopilot_finds_parameters_that_prevent_arming_in_a_dry_run(parameters, change):
     ready = replace(COPTER, parameters=PLAIN | parameters)
     assert wrong(ready) == {}
     assert wrong(ready, plan=DRY) == {"channel": (change,)}
@@ -242,7 +242,7 @@ def test_explain_silence_names_the_cause(link, bad_bytes, others, refused, code,
     assert finding.reason.parameters.items() >= {"address": str(link), **cause}.items()
 
 
-def test_how_to_pages_name_the_changes_that_doctor_wants():
+def test_doctor_changes_are_on_the_how_to_pages():
     docs = Path(__file__).parents[3] / "docs/how-to"
     copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
     bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
@@ -322,7 +322,7 @@ def test_doctor_waits_for_a_frame_of_the_camera(link, capsys, tmp_path):
 @pytest.mark.network
 @pytest.mark.usefixtures("_quick")
 @pytest.mark.parametrize(("where", "code"), [("here", 1), ("udpout:no-such-host.invalid:14550", 2)])
-def test_doctor_checks_the_machine_where_no_autopilot_is(where, code, link, capsys):
+def test_doctor_checks_the_machine_without_an_autopilot(where, code, link, capsys):
     assert main(["doctor", "--link", link if where == "here" else where]) == code
     found = findings_of(capsys.readouterr().out)
     assert not found["link"]

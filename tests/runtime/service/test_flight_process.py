@@ -26,7 +26,7 @@ def fly(recording, tmp_path):
     return started
 
 
-def test_run_sends_what_the_log_says(fly, tmp_path):
+def test_run_sends_what_it_logs(fly, tmp_path):
     with simulated_autopilot() as (link, asked):
         run = fly("--link", link, "--rate-hz", "3")  # ten seconds: a vehicle must have been heard before the first fix
         said = ended(run)
@@ -61,7 +61,7 @@ def test_run_sends_what_the_log_says(fly, tmp_path):
 WITHHELD = {"DRY_RUN", "NO_TELEMETRY"}  # the second for five seconds
 
 
-def test_dry_run_sends_all_but_fixes(fly, tmp_path):
+def test_dry_run_sends_everything_but_fixes(fly, tmp_path):
     with simulated_autopilot() as (link, asked):
         said = ended(fly("--link", link, "--rate-hz", "20", "--dry-run"))
         seen = asked()
@@ -147,7 +147,7 @@ def test_run_puts_a_relative_log_into_the_folder_of_logs(fly, tmp_path):
     assert list(read_log(tmp_path / "logs" / "own.jsonl"))[-1]["kind"] == "end"
 
 
-def test_service_flies_where_no_status_can_be_written_and_opens_no_port(fly, tmp_path):
+def test_service_runs_without_a_writable_status_and_opens_no_port(fly, tmp_path):
     config, status = tmp_path / "c.yaml", tmp_path / "nowhere" / "s"
     config.write_text(f"status: {{file: {status}}}\n")
     assert str(status) in ended(fly("--config", config), code=1)

@@ -32,7 +32,7 @@ def route(stack: ExitStack, station: int) -> tuple[int, int]:
     return ends[0].number, ends[1].number
 
 
-def test_the_example_with_mavsdk_says_whether_the_place_is_known(recording, tmp_path):
+def test_mavsdk_example_reports_whether_the_place_is_recognised(recording, tmp_path):
     ground = free_port()
     with ExitStack() as stack:
         station = stack.enter_context(mavsdk_example(ground, tmp_path))

@@ -20,7 +20,7 @@ def shown(place, figures):
     return picture
 
 
-def test_mask_of_map_and_flight_leaves_a_display_out(tmp_path):
+def test_mask_of_map_and_flight_excludes_a_display(tmp_path):
     write_flight(tmp_path / "ref", [shown(place, "BAT 16.2V HOME 412m ALT") for place in range(4)])
     allowed = np.full((240, 320), 255, np.uint8)
     allowed[:60], allowed[190:] = 0, 0

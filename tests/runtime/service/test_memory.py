@@ -61,7 +61,7 @@ def test_flight_completes_within_a_hard_limit_of_memory(flight):
     assert largest["VmPeak"] < LIMIT_BYTES / 1e6
 
 
-def test_flight_takes_60_mb_and_140_with_the_libraries(flight):
+def test_flight_uses_60_mb_and_140_with_libraries(flight):
     largest = flight[1]
     assert 30 < largest["Pss"] <= largest["VmHWM"]
     assert largest["RssAnon"] < 60
@@ -74,7 +74,7 @@ def test_flight_does_not_grow_from_query_to_query(flight):
     assert max(told_mb[WARM_AFTER:]) < told_mb[WARM_AFTER - 1] + 4
 
 
-def test_flight_loads_no_library_that_it_does_not_need(flight):
+def test_flight_loads_no_unneeded_library(flight):
     mapped = flight[2]
     assert "cv2" in mapped
     assert "onnxruntime" not in mapped

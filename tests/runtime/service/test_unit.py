@@ -55,7 +55,7 @@ def test_unit_keeps_its_exposure_under_two(tmp_path):
     assert judged.returncode == 0, judged.stdout
 
 
-def test_unit_requires_no_medium_that_may_be_pulled_in_flight():
+def test_unit_requires_no_removable_storage():
     """systemd stops a service with the mount that it requires, and starts neither again."""
     said = directives(UNIT.read_text())
     requiring = {"WorkingDirectory", "StateDirectory", "LogsDirectory", "RequiresMountsFor", "Requires", "BindsTo"}
@@ -65,7 +65,7 @@ def test_unit_requires_no_medium_that_may_be_pulled_in_flight():
     assert {f"{folder[1:].replace('/', '-')}.mount" for folder in folders} < set(said["After"].split())
 
 
-def test_unit_is_that_of_the_default_board():
+def test_unit_file_in_deploy_is_that_of_the_default_board():
     assert UNIT.read_text() == render_unit(load_board("rpi-zero-2w"))
 
 
@@ -85,7 +85,7 @@ def test_render_unit_escapes_the_name_of_the_board():
     assert directives(unit)["ExecStartPre"] == directives(UNIT.read_text())["ExecStartPre"]
 
 
-def test_unit_finds_what_the_commands_of_the_page_install():
+def test_unit_finds_the_files_installed_by_the_documented_commands():
     said, page = directives(UNIT.read_text()), (DEPLOY / "README.md").read_text()
     commands = "".join(re.findall(r"(?ms)^```sh$(.*?)^```$", page))
     program, config = said["ExecStart"].split()[0], said["ExecStart"].split()[-1]
@@ -105,7 +105,7 @@ def test_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
     assert "\nEnvironment=EDGEVPR_MODELS=/var/lib/edgevpr/models\n" in UNIT.read_text()
 
 
-def test_unit_leaves_serial_ports_and_cameras_within_reach():
+def test_unit_allows_serial_ports_and_cameras():
     unit = directives(UNIT.read_text())
     # /dev/video*, /dev/media* and /run/udev, which libcamera and GStreamer read, are not hidden.
     hidden = {"PrivateDevices", "InaccessiblePaths", "TemporaryFileSystem", "RootDirectory", "MountAPIVFS"}
