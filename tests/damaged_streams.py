@@ -9,10 +9,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -236,25 +236,19 @@ def run(
     for name in _TOO_SLOW:
         slow = f"{name}, decoded too slowly"
         if only(slow):
-            with _slow_decoder(_SLOWER / rate_hz):
+            with patch.object(VideoDecoder, "decode", _slow_down(VideoDecoder.decode, _SLOWER / rate_hz)):
                 rows.append(_judge(slow, cameras[name](replace(film, count=_LONGER * count))))
     return rows
 
 
-@contextmanager
-def _slow_decoder(work_s: float) -> Iterator[None]:
+def _slow_down(decode: Callable[..., object], work_s: float) -> Callable[..., object]:
     """Let every packet take so much longer to decode."""
-    decode = VideoDecoder.decode
 
     def slowly(whole: VideoDecoder, fetched: TimedPacket) -> object:
         time.sleep(work_s)
         return decode(whole, fetched)
 
-    VideoDecoder.decode = slowly
-    try:
-        yield
-    finally:
-        VideoDecoder.decode = decode
+    return slowly
 
 
 def _judge(stream: str, camera: Camera) -> Row:

@@ -1,13 +1,12 @@
 """Cameras that a program reads: on the ribbon cable of a Raspberry Pi, by a program that stands for rpicam-vid; and
 pipelines, by GStreamer itself where it is installed."""
 
-import os
 import shutil
 import subprocess
 import sys
 import time
-from pathlib import Path
 
+import fake_rpicam
 import pytest
 from loopback import wait_until
 
@@ -33,11 +32,7 @@ needs_gstreamer = pytest.mark.skipif(
 @pytest.fixture
 def rpicam(tmp_path, monkeypatch, opened):
     """rpicam-vid on the path, and a function that opens its camera."""
-    program = tmp_path / "rpicam-vid"
-    fake = Path(__file__).with_name("fake_rpicam.py")
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} {fake} "$@"\n')
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PATH", fake_rpicam.install(tmp_path))
     return lambda: opened("rpicam")
 
 

@@ -37,24 +37,17 @@ LEGS = 2
 _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
-def photographer(seed):
-    """Return the function that takes the picture of a pose in the generated flight."""
-    flight, rng = plan_mapping_flight(7), np.random.default_rng(seed)
-    scene = make_scene(7, 420.0, 220.0)
-    ground = light_scene(scene, flight.light, flight.seed)
-    return lambda pose: photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng), rng
-
-
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """A folder of pictures of two legs, their true poses, and noisy positions of which one is a glitch."""
     folder = tmp_path_factory.mktemp("flown")
     (folder / "images").mkdir()
-    shot_of, rng = photographer(7)
-    poses = plan_mapping_flight(7).poses[: 14 * LEGS]
-    tags = {}
+    flight, rng, tags = plan_mapping_flight(7), np.random.default_rng(7), {}
+    scene, poses = make_scene(7, 420.0, 220.0), flight.poses[: 14 * LEGS]
+    ground = light_scene(scene, flight.light, flight.seed)
     for number, pose in enumerate(poses):
-        cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot_of(pose))
+        image = photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng)
+        cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), image)
         true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
         east_m += GLITCH_M if number == 9 else 0.0
         at = move_position(true, east_m, north_m)

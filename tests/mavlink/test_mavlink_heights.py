@@ -63,6 +63,14 @@ class Vehicle:
         return texts
 
 
+@pytest.fixture
+def vehicle():
+    """One that has taken off, and is 100 m high."""
+    vehicle = Vehicle()
+    vehicle.take_off()
+    return vehicle
+
+
 def near(height_m):
     return pytest.approx(height_m, abs=1.0)
 
@@ -80,9 +88,7 @@ def test_height_starts_at_the_ground_wherever_home_is(home_m):
 
 @pytest.mark.parametrize("moved_m", [100.0, 150.0, -60.0, -GROUND_M])
 @pytest.mark.parametrize("climb_m_s", [0.0, 4.0])
-def test_height_is_unchanged_if_home_is_set_in_flight(moved_m, climb_m_s):
-    vehicle = Vehicle()
-    vehicle.take_off()
+def test_height_is_unchanged_if_home_is_set_in_flight(vehicle, moved_m, climb_m_s):
     vehicle.home_m += moved_m
     assert vehicle.fly(climb_m_s=climb_m_s) == near(vehicle.height_m)
     assert vehicle.texts() == []
@@ -91,9 +97,7 @@ def test_height_is_unchanged_if_home_is_set_in_flight(moved_m, climb_m_s):
 
 
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 12.0])
-def test_height_is_unchanged_if_the_origin_is_set_in_flight(every_s):
-    vehicle = Vehicle()
-    vehicle.take_off()
+def test_height_is_unchanged_if_the_origin_is_set_in_flight(vehicle, every_s):
     vehicle.home_m, vehicle.origin_m = vehicle.home_m + 300.0, 300.0
     assert vehicle.fly(24.0, climb_m_s=0.5, every_s=every_s) == near(vehicle.height_m)
     assert vehicle.texts() == []
@@ -107,18 +111,14 @@ def test_height_is_known_if_the_position_arrives_in_flight():
     assert vehicle.fly() == near(100.0)
 
 
-def test_height_ignores_an_altitude_jump_and_adds_uncertainty():
-    vehicle = Vehicle()
-    vehicle.take_off()
+def test_height_ignores_an_altitude_jump_and_adds_uncertainty(vehicle):
     vehicle.origin_m = 40.0
     assert vehicle.fly() == near(100.0)
     assert vehicle.autopilot.vehicle.height_doubt_m == near(40.0)
     assert vehicle.texts() == ["altitude jumped +40 m"]
 
 
-def test_height_follows_a_climb_missing_in_the_velocity():
-    vehicle = Vehicle()
-    vehicle.take_off()
+def test_height_follows_a_climb_missing_in_the_velocity(vehicle):
     assert vehicle.fly(20.0, climb_m_s=10.0, vz_cm_s=0, every_s=1.0) == pytest.approx(300.0, abs=11.0)
 
 
@@ -138,9 +138,7 @@ def test_height_of_a_px4_without_home_is_reset_once_it_has_one():
     assert vehicle.fly() == near(100.0)
 
 
-def test_height_is_kept_by_a_disarmed_gliding_vehicle():
-    vehicle = Vehicle()
-    vehicle.take_off()
+def test_height_is_kept_by_a_disarmed_gliding_vehicle(vehicle):
     vehicle.is_armed = False
     assert vehicle.fly(10.0, climb_m_s=-2.0) == near(80.0)
 

@@ -11,16 +11,11 @@ from edgevpr.lab.simulate.demo import summarise
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
-    GeneratedFlight,
     plan_mapping_flight,
     to_metres,
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-
-
-def first_frames(flight: GeneratedFlight, count: int) -> GeneratedFlight:
-    return replace(flight, poses=flight.poses[:count])
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +25,8 @@ def scene():
 
 @pytest.mark.slow
 def test_write_flight_writes_positions_to_a_decimetre(tmp_path, scene):
-    flight = first_frames(plan_mapping_flight(1), 17)
+    flight = plan_mapping_flight(1)
+    flight = replace(flight, poses=flight.poses[:17])
     names = list(write_flight(tmp_path, scene, flight))
     tags = read_positions(tmp_path / "positions.csv")
     assert list(tags) == names == sorted(path.name for path in (tmp_path / "images").iterdir())

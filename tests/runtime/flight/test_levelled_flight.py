@@ -34,33 +34,25 @@ def place_map(tmp_path_factory):
     return map_of(tmp_path_factory.mktemp("level") / "m.gpkg", technique, frames)
 
 
-class TimedLink(FakeLink):
-    """A link that remembers the times at which it was asked for the attitude."""
-
-    asked_s = ()
-
-    def predict_vehicle(self, t_mono_s):
-        self.asked_s = (*self.asked_s, t_mono_s)
-        return self.vehicle()
-
-
 def fly(place_map, log, turns, **said):
-    """The queries of a flight over the first places, the nose to the east where it `turns`."""
-    clock = FakeClock()
+    """The queries of a flight over the first places, the nose to the east where it `turns`, and the times at which its
+    link was asked for the attitude."""
+    clock, asked_s = FakeClock(), []
 
     def vehicle():
         return vehicle_at(50.0, 8.0, clock.now_s, heading_deg=90.0 if turns else 0.0, **said)
 
-    link = TimedLink(clock, vehicle=vehicle)
+    link = FakeLink(clock, vehicle=vehicle)
+    link.predict_vehicle = lambda t_mono_s: (asked_s.append(t_mono_s), vehicle())[1]
     images = [np.ascontiguousarray(np.rot90(textured(place + 20, 256, 256), turns)) for place in range(3)]
     source = FakeSource(images, clock, work=lambda: clock.sleep(1.0))
     lines = Flight(place_map, log, clock, link, **{"source.fov_deg": 66.0, "match.reach_m_s": 20.0}).fly(source)
-    return of_kind(lines, "query"), link
+    return of_kind(lines, "query"), asked_s
 
 
 def test_flight_reads_the_attitude_at_the_frame_time(place_map, tmp_path):
-    queries, link = fly(place_map, tmp_path / "f.jsonl", 1, roll_deg=0.2, pitch_deg=0.0, height_m=80.0)
-    assert list(link.asked_s) == [query["t_frame_s"] for query in queries]
+    queries, asked_s = fly(place_map, tmp_path / "f.jsonl", 1, roll_deg=0.2, pitch_deg=0.0, height_m=80.0)
+    assert asked_s == [query["t_frame_s"] for query in queries]
     assert [query["reference_image"] for query in queries if query["accepted"]] == ["0", "1", "2"]
     assert all(query["rotation_deg"] == 0 for query in queries), "each was turned north-up before it was asked"
     assert all(query["view"]["up_deg"] == 0.0 for query in queries)

@@ -183,16 +183,10 @@ def test_navigator_stream_stays_accurate_and_reports_its_accuracy():
     assert last.velocity_m_s[:2] == pytest.approx(tuple(air.velocity(air.t_s)), abs=1.5)
 
 
-class OnlyAtMatches(Navigator):
-    """A navigator as it would be without fixes between matches."""
-
-    def make_interim_fix(self, now_s):
-        return None
-
-
 def test_navigator_sends_the_observed_drift_between_matches():
     how = {"wind": WIND, "every_s": 10.0}
-    air, other = lost(**how), lost(OnlyAtMatches(1.0, 10.0), **how)
+    air, other = lost(**how), lost(**how)
+    other.navigator.make_interim_fix = lambda now_s: None
     errors_m, others_m = (lengths(each.fly(300).errors_m)[60:] for each in (air, other))
     assert np.median(errors_m) < 12
     assert errors_m.max() < 45

@@ -34,7 +34,7 @@ def test_recording_writes_reads_and_notes_in_order(tmp_path):
 @pytest.mark.parametrize("is_grey", [False, True])
 def test_recording_gives_the_flight_the_stored_image(tmp_path, is_grey):
     pictures = [textured(number, 240, 320) for number in range(3)]
-    pictures = [np.ascontiguousarray(each[:, :, 0]) if each.ndim == 3 and is_grey else each for each in pictures]
+    pictures = pictures if is_grey else [np.dstack((each, 255 - each, each // 2)) for each in pictures]
     clock = FakeClock()
     with Recording(tmp_path, 100) as tape:
         source = RecordedSource(FakeSource([*pictures, ImageError("it is torn")], clock), tape, tape.keep)

@@ -1,10 +1,9 @@
 """Findings of `edgevpr check` and `doctor` about cameras: program, devices, cable, and a frame that fits the lens."""
 
 import os
-import sys
-from pathlib import Path
 
 import cv2
+import fake_rpicam
 import numpy as np
 import pytest
 from distorted_cameras import wide
@@ -17,8 +16,6 @@ from edgevpr.frames.source import Source
 from edgevpr.runtime.service import camera
 from edgevpr.runtime.service.camera import check_camera, check_frame
 from edgevpr.runtime.service.findingcodes import FindingCode
-
-FAKE = Path(__file__).parents[2] / "frames/fake_rpicam.py"
 
 
 @pytest.fixture
@@ -34,10 +31,7 @@ def root(tmp_path):
 @pytest.fixture
 def rpicam(tmp_path, monkeypatch):
     """rpicam-vid on the path, by the program that stands for it."""
-    program = tmp_path / "rpicam-vid"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} {FAKE} "$@"\n')
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("PATH", fake_rpicam.install(tmp_path))
 
 
 @pytest.mark.process

@@ -10,6 +10,7 @@ import os
 import socket
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,6 +23,14 @@ SLOW_S = 2.0  # longer than a test lets streams take to open
 LISTED = (
     "Available cameras\n-----------------\n0 : imx219 [3280x2464 10-bit RGGB] (/base/soc/i2c0mux/i2c@1/imx219@10)\n"
 )
+
+
+def install(folder: Path) -> str:
+    """Write a program of the name of the real one into a folder; return a PATH that begins with the folder."""
+    program = folder / "rpicam-vid"
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} {__file__} "$@"\n')
+    program.chmod(0o755)
+    return f"{folder}{os.pathsep}{os.environ['PATH']}"
 
 
 def main() -> None:
