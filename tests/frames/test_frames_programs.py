@@ -123,7 +123,7 @@ def test_open_source_names_the_package_of_a_missing_program(monkeypatch, tmp_pat
 
 @pytest.mark.parametrize("pipeline", ["gst:", "gst: ! appsink", "gst: v4l2src device='/dev/video0"])
 def test_open_source_refuses_an_invalid_pipeline(pipeline):
-    with pytest.raises(SourceError, match="is not a pipeline"):
+    with pytest.raises(SourceError, match="must be `gst:` and a pipeline"):
         open_source(pipeline, live=True)
 
 
