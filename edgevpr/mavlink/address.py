@@ -26,8 +26,8 @@ class LinkAddress:
 
 def parse_link(url: str) -> LinkAddress:
     """Parse an address, such as `udpout:127.0.0.1:14550`. Raises LinkAddressError if it has none of the FORMS."""
-    kind, _, rest = url.partition(":")
-    target, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path contain colons
+    kind, _, remainder = url.partition(":")
+    target, _, number = remainder.rpartition(":")  # from the right: names in /dev/serial/by-path contain colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not target.strip() or not number:
         raise LinkAddressError(f"{url!r} is not a MAVLink address: use {FORMS}.")
     if kind != "serial" and ":" in target:

@@ -149,8 +149,8 @@ class AutopilotClock:
                 return True
             self._gap_end_s = None
         # Answers that contradict the newest one are from before a pause of one of the clocks.
-        kept = (old for old in self._answers if now_s - old.t_s <= _MAX_ANSWER_AGE_S and not old.contradicts(answer))
-        self._answers = [*kept, answer]
+        valid = (old for old in self._answers if now_s - old.t_s <= _MAX_ANSWER_AGE_S and not old.contradicts(answer))
+        self._answers = [*valid, answer]
         self._best = min(self._answers, key=lambda answer: answer.round_trip_s)
         return False
 

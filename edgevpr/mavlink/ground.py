@@ -106,8 +106,8 @@ class Texts:
         """Return the STATUSTEXT to send now; None if no text waits, or the last one was sent too recently."""
         if not self._waiting or now_s - self._sent_s < self._spacing_s:
             return None
-        topic, severity = chosen = min(self._waiting, key=lambda key: key[1])  # the oldest warning or, if none, note
-        self._sent_s, self._last[topic] = now_s, self._waiting.pop(chosen)
+        topic, severity = key = min(self._waiting, key=lambda item: item[1])  # the oldest warning or, if none, note
+        self._sent_s, self._last[topic] = now_s, self._waiting.pop(key)
         return make_status_text(severity, f"edgevpr: {self._last[topic]}")
 
     def remove_pauses(self) -> None:

@@ -192,9 +192,9 @@ class AutopilotReading:
         return VehicleKind(self.vehicle)
 
 
-def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
+def read_autopilot(link: RequestLink, names_by_firmware: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
     """Read, within ten seconds, what an autopilot reports about itself; return None if no heartbeat arrives.
-    `wanted`: names of the parameters to read, by firmware. Their names in other releases are also tried."""
+    `names_by_firmware`: names of the parameters to read, by firmware. Their names in other releases are also tried."""
     heartbeat = link.wait_for_heartbeat()
     if heartbeat is None:
         return None
@@ -212,7 +212,7 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
         mavlink.MAVLINK_MSG_ID_ATTITUDE,
     )
-    names = tuple(wanted.get(firmware, ())) if answers else ()
+    names = tuple(names_by_firmware.get(firmware, ())) if answers else ()
     # Without answers, each request would take three seconds. The last two messages are only counted.
     filter_state, gps_1, gps_2, origin, clock, *_ = (link.request_message(n) if answers else None for n in message_ids)
     parameters = link.request_parameters(names, is_px4)

@@ -249,8 +249,8 @@ class DriftFilter:
         """Do a Kalman update with the measurement matrix `matrix` (n, 12) and the values `measured` (n,)."""
         gain = np.linalg.solve(matrix @ self._p @ matrix.T + covariance, matrix @ self._p).T
         self._x = self._x + gain @ (measured - matrix @ self._x)
-        kept = np.eye(_SIZE) - gain @ matrix
-        self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
+        ikh = np.eye(_SIZE) - gain @ matrix  # I - K H
+        self._p = ikh @ self._p @ ikh.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
     def _make_position_jacobian(self, age_s: float, attitude_gain_s2: float) -> Doubles:
         """Return the observation matrix (2, 12) of a position measured `age_s` seconds ago, as an offset from the

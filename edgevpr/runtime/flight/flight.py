@@ -158,9 +158,9 @@ class Flight:
 
     def _remarks(self) -> tuple[str | None, ...]:
         """Return remarks for the status in addition to the counts, each in a few words (None: nothing to report)."""
-        held = self._governing.governor.held
+        restriction = self._governing.governor.restriction
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
-        return self._commands.summary, age, held, self._map_watch.summary, self._parts.flight_log.fault
+        return self._commands.summary, age, restriction, self._map_watch.summary, self._parts.flight_log.fault
 
     def _run_pass(self) -> None:
         """Run one pass of the loop, with one frame at most."""
@@ -283,7 +283,7 @@ class Flight:
 
 def _open_log(io: FlightIO) -> FlightLog:
     log, clock, is_service = io.log, io.clock, systemd.is_service()
-    return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb)
+    return FlightLog(log.path, clock.mono_s, clock.utc_s, retries=is_service, max_mb=log.max_mb)
 
 
 def open_link(

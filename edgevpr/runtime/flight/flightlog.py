@@ -59,10 +59,10 @@ class FlightLog:
         clock: Callable[[], float] = time.monotonic,
         utc_s: Callable[[], float] = time.time,
         *,
-        wait: bool = False,
+        retries: bool = False,
         max_mb: float | None = None,
     ) -> None:
-        """Open the file. Raises EdgevprError if that fails; with `wait`, for a service that may be restarted in the
+        """Open the file. Raises EdgevprError if that fails; with `retries`, for a service that may be restarted in the
         air, every line tries again instead. `clock` returns monotonic seconds."""
         self.path = path
         self.fault: str | None = None
@@ -80,7 +80,7 @@ class FlightLog:
             try:
                 self._open()
             except OSError as error:
-                if not wait:
+                if not retries:
                     raise EdgevprError(
                         f"The flight log {path} cannot be opened ({error.strerror}): use one file per flight, "
                         "in a folder that exists and is writable."

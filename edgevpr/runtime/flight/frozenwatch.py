@@ -256,10 +256,10 @@ def _read_velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
 
 def _compute_change_deg(earlier: Vehicle, now: Vehicle, name: str) -> float:
     """Return the change of an angle; 0 if it is unknown."""
-    before, after = getattr(earlier, name), getattr(now, name)
-    if before is None or after is None or not math.isfinite(before + after):
+    earlier_deg, now_deg = getattr(earlier, name), getattr(now, name)
+    if earlier_deg is None or now_deg is None or not math.isfinite(earlier_deg + now_deg):
         return 0.0
-    return float(wrap_deg(after - before))
+    return float(wrap_deg(now_deg - earlier_deg))
 
 
 def _subtract_error(angle_deg: float) -> float:

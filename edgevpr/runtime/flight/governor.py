@@ -43,13 +43,13 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change from the setting `before` to `after`, and why. `back`: the change is upwards. The settings are equal if a
-    limit is exceeded and no lower setting is left."""
+    """Change from the setting `before` to `after`, and why. `is_upward`: to a higher setting. The settings are equal if
+    a limit is exceeded and no lower setting is left."""
 
     before: Setting
     after: Setting
     why: Reason
-    back: bool = False
+    is_upward: bool = False
 
 
 def list_settings(configured: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
@@ -80,7 +80,7 @@ class Governor:
         return self._settings[self._index]
 
     @property
-    def held(self) -> str | None:
+    def restriction(self) -> str | None:
         """Lowered settings, in a few words; None if none is lowered."""
         now, full = self.setting, self._settings[0]
         parts = (
@@ -92,7 +92,7 @@ class Governor:
     def update(self, now_s: float, reading: LoadReading) -> Change | None:
         """Process a measurement over one second and a whole number of queries; return the change to
         make."""
-        hot, exceeded = self._check_load(reading)
+        is_hot, exceeded = self._check_load(reading)
         max_mb = self._board.memory_max_mb
         has_headroom = self._has_headroom(reading, self._settings[max(0, self._index - 1)])
         exceeded_s = self._measure_held_s("exceeded", now_s, exceeded is not None)
@@ -106,16 +106,16 @@ class Governor:
             return self._report_limit(
                 "memory", Reason(ReasonCode.MEMORY_OVER_LIMIT, {"used_mb": reading.rss_mb, "max_mb": max_mb})
             )
-        is_cooling = hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S
+        is_cooling = is_hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S
         if exceeded is not None and exceeded_s >= _MIN_EXCEEDED_S and not is_cooling:
-            if hot:
+            if is_hot:
                 self._step_up_wait_s = max(self._step_up_wait_s, _MIN_HEAT_WAIT_S)
-            if (lower_index := self._find_lower(hot)) is not None:
+            if (lower_index := self._find_lower(is_hot)) is not None:
                 return self._step_down(now_s, lower_index, exceeded)
             return None if "load" in self._reported else self._report_limit("load", exceeded)
         if self._index > 0 and headroom_s >= self._step_up_wait_s:
             self._stepped_up_s = now_s
-            return self._change(now_s, self._index - 1, Reason(ReasonCode.RESOURCES_FREE), back=True)
+            return self._change(now_s, self._index - 1, Reason(ReasonCode.RESOURCES_FREE), is_upward=True)
         return None
 
     def _measure_held_s(self, name: str, now_s: float, holds: bool) -> float:
@@ -125,11 +125,11 @@ class Governor:
             return 0.0
         return now_s - self._since_s.setdefault(name, now_s)
 
-    def _find_lower(self, hot: bool) -> int | None:
-        """Return the index of the next lower setting; if `hot`, of the next with a lower rate, which cools faster."""
+    def _find_lower(self, is_hot: bool) -> int | None:
+        """Return the index of the next lower setting; if `is_hot`, of the next with a lower rate to cool faster."""
         lower = range(self._index + 1, len(self._settings))
         slower = [index for index in lower if self._settings[index].rate_hz < self.setting.rate_hz]
-        return next(iter(slower if hot and slower else lower), None)
+        return next(iter(slower if is_hot and slower else lower), None)
 
     def _check_load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
         """Return whether the board is too hot, and the exceeded limit (None: none is exceeded)."""
@@ -168,13 +168,13 @@ class Governor:
             self._stepped_up_s = -math.inf  # further steps down for the same reason are not a new failure
         elif now_s - self._changed_s >= max(_STEP_UP_TRIAL_S, 2 * self._step_up_wait_s):
             self._step_up_wait_s = _MIN_WAIT_S
-        return self._change(now_s, index, why, back=False)
+        return self._change(now_s, index, why, is_upward=False)
 
-    def _change(self, now_s: float, index: int, why: Reason, back: bool) -> Change:
+    def _change(self, now_s: float, index: int, why: Reason, is_upward: bool) -> Change:
         before = self.setting
         self._index, self._changed_s = index, now_s
         self._since_s.clear()  # readings before a change do not describe the time after it
-        return Change(before, self.setting, why, back)
+        return Change(before, self.setting, why, is_upward)
 
 
 class GovernorActuator:
@@ -197,8 +197,8 @@ class GovernorActuator:
         change = self.governor.update(parts.io.clock.mono_s(), parts.meter.reading())
         if change is None:
             return
-        text = gcs_text = self.governor.held or "back to the configured settings"
-        severity = Severity.INFO if change.back else Severity.NOTICE
+        text = gcs_text = self.governor.restriction or "back to the configured settings"
+        severity = Severity.INFO if change.is_upward else Severity.NOTICE
         if change.before == change.after:
             text = "over a limit of the board, and no lower setting is left"
             gcs_text, severity = "over a limit of its board, see its log", Severity.WARNING

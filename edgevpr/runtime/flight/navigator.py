@@ -211,7 +211,7 @@ class Navigator(Listener):
     def accuracy_m(self, now_s: float) -> float | None:
         """Return the accuracy of the position: metres, standard deviation of one axis (None: position unknown)."""
         estimate = self._navigation.estimate_state(now_s)
-        return None if estimate is None else self._claimed_m(estimate)
+        return None if estimate is None else self._compute_claimed_m(estimate)
 
     def estimate_state(self, t_s: float) -> MotionState | None:
         """Return position and motion at `t_s` for a continuous channel; None if they are not accurate enough. `t_s`
@@ -236,10 +236,10 @@ class Navigator(Listener):
             # The autopilot's own altitude may come from us, so with a receiver its altitude is sent.
             alt_m=receiver.alt_m if is_fallback and receiver and receiver.alt_m is not None else vehicle.alt_m,
             velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-            accuracy_m=factor * math.hypot(self._claimed_m(estimate), lag_m),
+            accuracy_m=factor * math.hypot(self._compute_claimed_m(estimate), lag_m),
             alt_accuracy_m=_ALT_SD_M,
             speed_accuracy_m_s=factor * estimate.speed_accuracy_m_s,
-            attitude=None if attitude is None else _in_radians(attitude),
+            attitude=None if attitude is None else _to_radians(attitude),
             is_fallback=is_fallback,
         )
 
@@ -303,11 +303,11 @@ class Navigator(Listener):
         estimate = self._navigation.estimate_state(now_s)
         if estimate is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
-        ours, claimed_m = estimate.position, self._claimed_m(estimate)
+        position, claimed_m = estimate.position, self._compute_claimed_m(estimate)
         east_m_s, north_m_s = velocity_m_s
         age_s = now_s - vehicle.t_received_s
         theirs_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
-        error_m = float(distance_m(*theirs_deg, ours.lat_deg, ours.lon_deg))
+        error_m = float(distance_m(*theirs_deg, position.lat_deg, position.lon_deg))
         # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by error_m**2.
         if error_m**2 <= 2 * estimate.accuracy_m**2:
             figures = {"distance_m": error_m, "accuracy_m": estimate.accuracy_m}
@@ -315,7 +315,7 @@ class Navigator(Listener):
         # Lead by the drift of half the time to the next fix, so that the autopilot is correct halfway. Now it
         # is wrong by this lead, in one direction: half of its square is added to the variance of each axis.
         lead_m = [self._fix_interval_s / 2 * drift_m_s for drift_m_s in self._navigation.path_drift_m_s()]
-        sent_deg = offset_position(ours.lat_deg, ours.lon_deg, *lead_m)
+        sent_deg = offset_position(position.lat_deg, position.lon_deg, *lead_m)
         return Advice(Fix(*sent_deg, math.hypot(claimed_m, math.hypot(*lead_m) / math.sqrt(2)), now_s))
 
     def _correlation_factor(self, t_s: float) -> float:
@@ -324,7 +324,7 @@ class Navigator(Listener):
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 
-    def _claimed_m(self, estimate: NavState) -> float:
+    def _compute_claimed_m(self, estimate: NavState) -> float:
         """Return the accuracy to claim for an estimate: never better than the error common to all fixes."""
         return max(self._shared_sd_m, estimate.accuracy_m)
 
@@ -336,5 +336,5 @@ def _choose_drift(channel: Channel) -> Drift:
     return INERTIAL if channel.is_continuous else DEAD_RECKONING
 
 
-def _in_radians(attitude: Attitude) -> tuple[float, float, float]:
+def _to_radians(attitude: Attitude) -> tuple[float, float, float]:
     return math.radians(attitude.roll_deg), math.radians(attitude.pitch_deg), math.radians(attitude.yaw_deg)

@@ -52,12 +52,12 @@ _RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))  # of a Rayleigh distribution with
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySample:
-    """A match `off_m` (2,) metres east and north of GPS: the product of `jacobian` (2, 6) and the parameters. The
+    """A match `offset_m` (2,) metres east and north of GPS: the product of `jacobian` (2, 6) and the parameters. The
     variance of each axis, m2, is the sum of `independent_m2` and `correlated_m2`, an error that `correlation` samples
     have in common. `distrusts_gps`: GPS was distrusted at that time."""
 
     jacobian: Doubles
-    off_m: Doubles
+    offset_m: Doubles
     independent_m2: float
     correlated_m2: float
     correlation: float
@@ -139,13 +139,13 @@ class MapSurvey:
         correlation = max(1.0, _GPS_CORRELATION_S / min(t_s - self._last_s, _GPS_CORRELATION_S))
         self._origin = self._origin or reference
         jacobian[:, 4] = offset_between_m(self._origin, reference)
-        off_m = np.array(offset_between_m(reference, match.position))
+        offset_m = np.array(offset_between_m(reference, match.position))
         independent_m2 = float(np.trace(match.scatter_m2)) / 2 - located.tilt_m2  # the tilt is a parameter
         correlated_m2 = vehicle.gps.sd_m**2
         self._samples.append(
             SurveySample(
                 jacobian=jacobian,
-                off_m=off_m,
+                offset_m=offset_m,
                 independent_m2=independent_m2,
                 correlated_m2=correlated_m2,
                 correlation=correlation,
@@ -158,7 +158,7 @@ class MapSurvey:
     def set_mount(self, mount: Mount) -> None:
         """Set the mount used to level the next pictures, and convert the samples to it."""
         change = _compute_tangents(mount) - _compute_tangents(self._mount)
-        shifted = [replace(sample, off_m=sample.off_m - sample.jacobian[:, 2:4] @ change) for sample in self._samples]
+        shifted = [replace(old, offset_m=old.offset_m - old.jacobian[:, 2:4] @ change) for old in self._samples]
         self._mount, self._samples = mount, deque(shifted, maxlen=_MAX_SAMPLES)
 
     def _compute_jacobian(self, vehicle: Vehicle, height_m: float | None, heading_error_deg: float) -> Doubles | None:
@@ -212,7 +212,7 @@ def fit_samples(samples: list[SurveySample]) -> tuple[Doubles, Doubles, Bools]:
     the matches inflates the covariance.
     """
     jacobian = np.array([sample.jacobian for sample in samples])
-    off_m = np.array([sample.off_m for sample in samples])
+    offset_m = np.array([sample.offset_m for sample in samples])
     independent_m2, correlated_m2, correlation = np.array(
         [(sample.independent_m2, sample.correlated_m2, sample.correlation) for sample in samples]
     ).T
@@ -220,8 +220,8 @@ def fit_samples(samples: list[SurveySample]) -> tuple[Doubles, Doubles, Bools]:
     for iteration in range(_HUBER_ITERATIONS + _REJECTION_ITERATIONS):
         weight = inlier_weights / (independent_m2 + correlation * correlated_m2)
         normal = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) + _PRIOR_INFORMATION
-        solution = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weight, jacobian, off_m))
-        residual_sd = np.linalg.norm(off_m - jacobian @ solution, axis=1) / np.sqrt(independent_m2 + correlated_m2)
+        solution = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weight, jacobian, offset_m))
+        residual_sd = np.linalg.norm(offset_m - jacobian @ solution, axis=1) / np.sqrt(independent_m2 + correlated_m2)
         scatter = max(1.0, float(np.median(residual_sd)) / _RAYLEIGH_MEDIAN)
         if iteration < _HUBER_ITERATIONS:
             inlier_weights = np.minimum(1.0, _HUBER_SIGMA * scatter / np.maximum(residual_sd, 1e-9))
@@ -244,7 +244,7 @@ def _is_gps_plausible(samples: list[SurveySample], is_inlier: Bools, to_middle: 
     distrusted = np.array([sample.distrusts_gps for sample in samples])
     if not distrusted.any():
         return True
-    residual_m = np.array([sample.off_m - sample.jacobian[:, 2:4] @ mount for sample in samples])
+    residual_m = np.array([sample.offset_m - sample.jacobian[:, 2:4] @ mount for sample in samples])
     distrusted &= np.linalg.norm(residual_m, axis=1) > _MAX_TRUSTED_M
     halves = np.array_split(np.arange(len(samples)), 2)
     if min(np.mean(~distrusted[half]) for half in halves) < _MIN_TRUSTED_FRACTION:

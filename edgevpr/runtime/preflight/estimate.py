@@ -126,17 +126,17 @@ def _recommend(
         return None, f"None: the cost of every technique is {explain_unknown_costs(board)}."
     if not options:
         return None, "None: no technique can be used on this machine."
-    chosen = choose_best(options, board)
-    if chosen is None:
+    best = choose_best(options, board)
+    if best is None:
         return None, f"None: {explain_no_choice(options, board)}."
-    row = rows[options.index(chosen)]
+    row = rows[options.index(best)]
     reason = "it is set in the board's profile, and was never measured"
-    if chosen.accuracy:
-        reason = f"the most accurate that fits: {chosen.accuracy}"
-    return chosen.label, (
-        f"{chosen.label}: {reason}; {chosen.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
-        f"{chosen.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), "
-        f"{chosen.cpu_s / chosen.t_query_s / board.cores:.0%} of the CPU during a query, and "
+    if best.accuracy:
+        reason = f"the most accurate that fits: {best.accuracy}"
+    return best.label, (
+        f"{best.label}: {reason}; {best.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
+        f"{best.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), "
+        f"{best.cpu_s / best.t_query_s / board.cores:.0%} of the CPU during a query, and "
         f"{row.flight_marginal_mah:.3g} mAh per flight in addition to the "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} mAh of the idle board."
     )

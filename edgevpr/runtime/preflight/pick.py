@@ -57,13 +57,13 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
         return unknown[0]
     if not options:
         raise ModelError("No technique is usable: fix the problems listed above, or use another technique.")
-    chosen = choose_best(options, board)
-    if chosen is None:
+    best = choose_best(options, board)
+    if best is None:
         _log.warning("using technique %s anyway: %s", options[0].name, explain_no_choice(options, board))
         return options[0].name
-    others = [f"{other.label} {other.objection}" for other in options if other.name != chosen.name and other.objection]
-    _log.info("technique %s: %s", chosen.label, "; ".join([describe_option(board, chosen, demand), *others]))
-    return chosen.name
+    others = [f"{other.label} {other.objection}" for other in options if other.name != best.name and other.objection]
+    _log.info("technique %s: %s", best.label, "; ".join([describe_option(board, best, demand), *others]))
+    return best.name
 
 
 def explain_technique(recogniser: Recogniser, is_named: bool) -> str:

@@ -53,13 +53,13 @@ def _make_accuracy_row(row: TechniqueEstimate, recommended: str | None) -> list[
     option, accuracy = row.option, row.option.accuracy
     if accuracy is None:
         return [option.label, "?", "?", "?", "", "", "never measured"]
-    chosen = "needs a sequence" if option.objection else "another is better"
+    choice = "needs a sequence" if option.objection else "another is better"
     if option.misfit:
-        chosen = ""
+        choice = ""
     elif option.label == recommended:
-        chosen = "yes"
+        choice = "yes"
     elif accuracy.accepted_elsewhere:
-        chosen = "wrong places"
+        choice = "wrong places"
     accepted, wrong = f"{accuracy.accepted} of {accuracy.asked}", f"{accuracy.accepted_elsewhere}{accuracy.neighbours}"
     counts = str(accuracy.sets), str(accuracy.queries)
-    return [option.label, f"{accuracy.recall_at_1:.2f}", accepted, wrong, *counts, chosen]
+    return [option.label, f"{accuracy.recall_at_1:.2f}", accepted, wrong, *counts, choice]

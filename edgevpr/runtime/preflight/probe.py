@@ -211,8 +211,8 @@ def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
 
 def _subtract(cost: StageCost, part: StageCost) -> StageCost:
     """Return `cost` minus `part`, but at least a thousandth of `cost`, because clocks are inexact."""
-    least = cost * 0.001
-    return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))
+    minimum = cost * 0.001
+    return StageCost(max(cost.wall_s - part.wall_s, minimum.wall_s), max(cost.cpu_s - part.cpu_s, minimum.cpu_s))
 
 
 def _find_least(costs: list[StageCost]) -> StageCost:

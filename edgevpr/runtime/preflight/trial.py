@@ -49,9 +49,9 @@ def list_trials(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] 
     ModelError for an incomplete model card."""
     trials = []
     for name in names:
-        chosen = dict((settings or {}).get(name, {}))
-        has_one_form = "form" in chosen or "form" not in techniques.read_parameters(name)
-        for variant in (chosen,) if has_one_form else ({**chosen, "form": form} for form in FORMS):
+        fixed = dict((settings or {}).get(name, {}))
+        has_one_form = "form" in fixed or "form" not in techniques.read_parameters(name)
+        for variant in (fixed,) if has_one_form else ({**fixed, "form": form} for form in FORMS):
             trials.append(Trial(label=techniques.format_name(name, variant.get("form")), name=name, settings=variant))
     return tuple(trials)
 

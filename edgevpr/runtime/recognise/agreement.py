@@ -132,10 +132,10 @@ def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | No
     if expected is not None:
         bit_counts[~_find_pairs(query, place, query_points, place_points, expected)] = np.inf
     best = bit_counts.argmin(axis=1)
-    least = bit_counts[np.arange(len(query_points)), best]
+    min_bits = bit_counts[np.arange(len(query_points)), best]
     is_mutual = bit_counts.argmin(axis=0)[best] == np.arange(len(query_points))
-    mutual = np.flatnonzero(is_mutual & (least <= _MAX_DIFFERENT_BITS))
-    mutual = mutual[np.argsort(least[mutual], kind="stable")]
+    mutual = np.flatnonzero(is_mutual & (min_bits <= _MAX_DIFFERENT_BITS))
+    mutual = mutual[np.argsort(min_bits[mutual], kind="stable")]
     query_points, place_points = query_points[mutual].astype(complex), place_points[best[mutual]].astype(complex)
     similarity = _find_best(query_points, place_points, expected)
     no_agreement = replace(no_agreement, matched=len(mutual))
@@ -170,8 +170,8 @@ def _to_complex(landmarks: Landmarks) -> Array:
 
 def _count_differing_bits(one: Bytes, other: Bytes) -> Singles:
     """Count the differing bits of each pair of descriptors: uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
-    ours, theirs = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
-    return np.asarray((ours.shape[1] - ours @ theirs.T) / 2)
+    signs, other_signs = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
+    return np.asarray((signs.shape[1] - signs @ other_signs.T) / 2)
 
 
 def _find_pairs(
@@ -193,13 +193,13 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
     """Return True for a similarity near the expected overlay (None: for one of plausible scale). `turn_scale` and
     `shift` are its complex numbers, or arrays of them; the result has the same shape."""
     if expected is None:  # only the scale is limited
-        least, most = _SCALE_LIMITS
-        return np.asarray((np.abs(turn_scale) >= least) & (np.abs(turn_scale) <= most))
+        min_scale, max_scale = _SCALE_LIMITS
+        return np.asarray((np.abs(turn_scale) >= min_scale) & (np.abs(turn_scale) <= max_scale))
     difference = turn_scale / expected.turn_scale
     rotation_deg, log_scale = np.abs(np.angle(difference, deg=True)), np.abs(np.log(np.abs(difference)))
-    most = np.log(_MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE)
+    max_log_scale = np.log(_MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE)
     is_shift_near = np.abs(shift - complex(*expected.shift_share)) <= _MAX_SHIFT_SHARE
-    return np.asarray((rotation_deg <= _MAX_TURN_DEG) & (log_scale <= most) & is_shift_near)
+    return np.asarray((rotation_deg <= _MAX_TURN_DEG) & (log_scale <= max_log_scale) & is_shift_near)
 
 
 def _find_best(query_points: Array, place_points: Array, expected: Overlay | None) -> tuple[complex, complex] | None:

@@ -161,18 +161,18 @@ class Belief:
         indices: Ints = np.zeros(0, int)
         if proposed is None:
             lost += appears  # an aircraft that enters the map now is at an unknown place
-            updated = _keep_missed(now, moves, 1.0)
+            updated = _predict_misses(now, moves, 1.0)
         else:
             self._enters = _ENTER_CHANCE
             indices, proposed = _select_usable(proposed, self._scale)
-            found, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, appears, places)
+            hits, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, appears, places)
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
-            missed = _keep_missed(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
+            misses = _predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
             # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
-            min_gain = (factor * odds * lost - float(missed.weight.sum())) / max(float(found.weight.sum()), _MIN_WEIGHT)
-            found = replace(found, weight=found.weight * max(1.0, min_gain) ** staleness)
-            pairs = {name: (getattr(found, name), getattr(missed, name)) for name in _Hypotheses.__slots__}
+            min_gain = (factor * odds * lost - float(misses.weight.sum())) / max(float(hits.weight.sum()), _MIN_WEIGHT)
+            hits = replace(hits, weight=hits.weight * max(1.0, min_gain) ** staleness)
+            pairs = {name: (getattr(hits, name), getattr(misses, name)) for name in _Hypotheses.__slots__}
             updated = _Hypotheses(**{name: np.concatenate(pair) for name, pair in pairs.items()})
         weight = updated.weight / (lost + float(updated.weight.sum()))
         probability[indices] = weight[: len(indices)]
@@ -205,12 +205,13 @@ class Belief:
         step *= (motion.reach / np.maximum(np.hypot(*step.T), max(motion.reach, _MIN_DIVISOR)))[:, None]
         remaining, mean_move = np.ones(len(now.weight)), np.zeros(2)
         sd = max(reach / _REACH_SIGMAS, _CV_SD * scale.spacing)
-        if (moved := motion.displacement) is not None:
+        if (displacement := motion.displacement) is not None:
             probability, min_sd, relative_sd = _VISUAL_ODOMETRY if motion.is_visual else _REPORTED_ODOMETRY
-            spread = (relative_sd**2 * moved @ moved + (min_sd * scale.spacing) ** 2) * np.eye(2)
-            moves.append(_Prediction(probability * remaining, now.position + moved, now.covariance + spread))
+            spread = (relative_sd**2 * displacement @ displacement + (min_sd * scale.spacing) ** 2) * np.eye(2)
+            moves.append(_Prediction(probability * remaining, now.position + displacement, now.covariance + spread))
             # Odometry wrong by a factor of two has an error as large as the displacement itself.
-            remaining, mean_move, sd = (1 - probability) * remaining, moved, min(sd, scale.spacing + math.hypot(*moved))
+            remaining, mean_move = (1 - probability) * remaining, displacement
+            sd = min(sd, scale.spacing + math.hypot(*displacement))
         variance = (_CV_SD * scale.spacing) ** 2 + (_CV_SD * np.hypot(*step.T)) ** 2 / 2
         cv_covariance = now.covariance + variance[:, None, None] * np.eye(2)
         moves.append(_Prediction(_CV_PROBABILITY * has_velocity * remaining, now.position + step, cv_covariance))
@@ -250,7 +251,7 @@ class Belief:
             move.probability[:, None] * evidence * _compute_density(move, position, cov, scale.is_ordinal)
             for move in moves
         ]
-        weight = sum(moved.sum(0) for moved in weights)
+        weight = sum(matrix.sum(0) for matrix in weights)
         origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): fraction of a candidate's weight
         stale = origin * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + appeared).sum()))
@@ -298,7 +299,7 @@ class Belief:
         return replace(estimate, covariance=covariance, heading_deg=heading_deg)
 
 
-def _keep_missed(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:
+def _predict_misses(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:
     """Return the moved hypotheses if the query proposes none of them, with the weight multiplied by this likelihood."""
     probability = np.stack([move.probability for move in moves], 1)[..., None]
     position = np.stack([move.position for move in moves], 1)

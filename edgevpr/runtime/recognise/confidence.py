@@ -130,11 +130,11 @@ class Model:
         return self.scale.confidence(max_wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _SHIPPED_FACTOR))
 
 
-def parse_model(stored: Mapping[str, Any]) -> Model:
+def parse_model(fields: Mapping[str, Any]) -> Model:
     """Make a model from decoded JSON. Raises KeyError or TypeError for invalid contents."""
-    scales = {name: stored[name] and _make_scale(**stored[name]) for name in ("scale", "adapted_scale")}
-    regressions = {name: _make_logistic(**stored[name]) for name in ("of_map", "of_place")}
-    return Model(**{**stored, **regressions, **scales})
+    scales = {name: fields[name] and _make_scale(**fields[name]) for name in ("scale", "adapted_scale")}
+    regressions = {name: _make_logistic(**fields[name]) for name in ("of_map", "of_place")}
+    return Model(**{**fields, **regressions, **scales})
 
 
 @lru_cache

@@ -78,14 +78,14 @@ def detect_landmarks(
         return Landmarks(np.empty((0, 2), np.float32), none, none, np.empty((0, 32), np.uint8))
     points_px: Singles = np.array([point.pt for point in keypoints], np.float32)
     order = np.argsort([-point.response for point in keypoints], kind="stable")
-    chosen = order[_select_spread(points_px[order], count, longest_px / _CELLS)]
+    selected = order[_select_spread(points_px[order], count, longest_px / _CELLS)]
     centre = (np.array(size, np.float32) - 1) / 2
     width_px = np.array([point.size for point in keypoints], np.float32)
     return Landmarks(
-        np.asarray(((points_px - centre) / longest_px)[chosen], np.float32),
-        np.array([point.angle for point in keypoints], np.float32)[chosen],
-        np.asarray(width_px[chosen] / longest_px, np.float32),
-        np.asarray(bits[chosen], np.uint8),
+        np.asarray(((points_px - centre) / longest_px)[selected], np.float32),
+        np.array([point.angle for point in keypoints], np.float32)[selected],
+        np.asarray(width_px[selected] / longest_px, np.float32),
+        np.asarray(bits[selected], np.uint8),
     )
 
 

@@ -46,13 +46,13 @@ class Levelling:
     warped: only the distance on the ground from the point below the camera to the image's centre is computed,
     from the `mount` of the camera. A `lens` has its own mount.
 
-    With `below`, for places, the point below the camera becomes the centre. `on_gimbal`: a gimbal keeps the camera
+    With `below`, for places, the point below the camera becomes the centre. `is_on_gimbal`: a gimbal keeps the camera
     level. `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
     """
 
     lens: Lens | None = field(kw_only=False)
     below: bool = False
-    on_gimbal: bool = False
+    is_on_gimbal: bool = False
     is_live: bool
     mount: Mount = STRAIGHT_DOWN
     _has_warned: bool = field(default=False, init=False)
@@ -76,7 +76,7 @@ class Levelling:
         much ground as expected at its height or, if that is unknown, as the images of the map."""
         if vehicle and not (self.is_live and vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
-        if vehicle and self.on_gimbal:
+        if vehicle and self.is_on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
             return enlarge_image(
@@ -116,7 +116,7 @@ def make_levelling(
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
         if config.gimbal and mount == STRAIGHT_DOWN:
             return None
-    return Levelling(lens, below=below, on_gimbal=config.gimbal, is_live=is_live(config.uri), mount=mount)
+    return Levelling(lens, below=below, is_on_gimbal=config.gimbal, is_live=is_live(config.uri), mount=mount)
 
 
 def read_camera_lens(config: SourceConfig) -> Lens | None:

@@ -55,10 +55,10 @@ class VisualOdometry:
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
-        before, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
-        if before is None or not 0 < t_s - before[0] <= _MAX_ELAPSED_S:
+        last, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
+        if last is None or not 0 < t_s - last[0] <= _MAX_ELAPSED_S:
             return None
-        from_s, start, previous = before
+        from_s, start, previous = last
         if start.nadir_offset is None or view.nadir_offset is None or start.up_deg is None or view.up_deg is None:
             return None
         if start.footprint_m is None or view.footprint_m is None:

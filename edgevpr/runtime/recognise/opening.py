@@ -121,8 +121,8 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate
 
 def make_technique(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
     """Make the technique `name`; its network runs on `threads` threads (None: one) unless `settings` give a number."""
-    own = {"threads": threads} if threads and "threads" in techniques.read_parameters(name) else {}
-    return techniques.create(name, {**own, **(settings or {})})
+    defaults = {"threads": threads} if threads and "threads" in techniques.read_parameters(name) else {}
+    return techniques.create(name, {**defaults, **(settings or {})})
 
 
 def create_technique(

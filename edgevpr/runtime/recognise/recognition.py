@@ -81,7 +81,7 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     landmarks, confidence, evidence, track (of the place filter).
     """
     evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
-    known: dict[str, Any] = {
+    optional: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.salience and event.salience.scores.rounded(),
         "odometry": event.odometry and event.odometry.fields(),
@@ -93,7 +93,7 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     return {
         "query": event.frame and event.frame.name,
         **_best_fields(event.best),
-        **{key: value for key, value in known.items() if value is not None and value != {}},
+        **{key: value for key, value in optional.items() if value is not None and value != {}},
         "accepted": event.accepted,
         "reason": event.reason.fields(),
         "accuracy_m": event.accuracy_m,

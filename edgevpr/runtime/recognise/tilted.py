@@ -34,8 +34,8 @@ def measure_again(picture: LevelledImage, technique: Technique, fine: Array, fir
     warp = Homography(out_from_pixel, corners, side, longest / (side * scale))
     mask = warp.visible if picture.mask is None else warp.visible & warp.warp_mask(picture.mask)
     warped = technique.encode(warp.warp_image(picture.image), mask)
-    again = technique.measure_perspective(warped, fine, _UNSHIFTED)
-    if again is None or again.regions < _MIN_REGIONS_RATIO * first.regions:
+    second = technique.measure_perspective(warped, fine, _UNSHIFTED)
+    if second is None or second.regions < _MIN_REGIONS_RATIO * first.regions:
         return None
-    over_place = again.over_place @ first.over_place
-    return Perspective(over_place / over_place[2, 2], scale * again.slope_sd, again.regions)
+    over_place = second.over_place @ first.over_place
+    return Perspective(over_place / over_place[2, 2], scale * second.slope_sd, second.regions)

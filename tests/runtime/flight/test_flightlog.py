@@ -272,7 +272,7 @@ def test_flight_log_refuses_a_log_in_use_and_a_service_waits_for_it(path):
         first.write("start", name="a")
         with pytest.raises(EdgevprError, match="another edgevpr process writes to it"):
             FlightLog(path)
-        second = FlightLog(path, wait=True)
+        second = FlightLog(path, retries=True)
         second.write("query", n=1)
         assert "another edgevpr" in second.fault
         first.write("query", n=0)
@@ -313,7 +313,7 @@ def test_flight_log_loses_no_line_and_no_file_at_kill_9(path):
 
 def test_flight_log_of_a_service_waits_for_its_storage(tmp_path, caplog):
     path = tmp_path / "card" / "flight.jsonl"
-    log = FlightLog(path, wait=True)
+    log = FlightLog(path, retries=True)
     assert str(path) in log.fault
     log.write("query", n=1)
     path.parent.mkdir()  # the card is put back

@@ -67,7 +67,7 @@ def test_governor_reverts_in_the_opposite_order():
     flight.fly(60)
     assert flight.governor.setting == Setting(0.25, 20)
     flight.fly(600)
-    assert [change.after for _, change in flight.changes if change.back] == [*reversed(flight.settings[:-1])]
+    assert [change.after for _, change in flight.changes if change.is_upward] == [*reversed(flight.settings[:-1])]
     assert flight.governor.setting == ASKED
 
 

@@ -222,7 +222,7 @@ def test_prepare_ignores_the_attitude_with_a_gimbal():
     frame = Frame(image=np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8), name="", t_mono_s=5.0)
     told = {"heading_deg": 30.0, "height_m": 80.0}
     banked, level = (vehicle_at(50.0, 8.0, 5.0, roll_deg=roll, pitch_deg=5.0 * roll, **told) for roll in (9.0, 0.0))
-    hung = Levelling(Lens(66.0), on_gimbal=True, is_live=True).prepare(frame, banked, None)
+    hung = Levelling(Lens(66.0), is_on_gimbal=True, is_live=True).prepare(frame, banked, None)
     fixed = Levelling(Lens(66.0), is_live=True).prepare(frame, level, None)
     assert hung.view == fixed.view
     assert np.array_equal(hung.image, fixed.image)
