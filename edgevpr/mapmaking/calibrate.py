@@ -35,7 +35,7 @@ from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.places.rows import escape_name
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, format_calibration
-from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, read_shipped_model
+from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, read_default_model
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
@@ -199,7 +199,7 @@ def _fit_calibration(answers: Sequence[QueryResult], kinds: Sequence[str], preci
     `precision`."""
     usable = [answer for answer in answers if answer.evidence]
     made_of = f"{len(usable)} answers of the map itself"
-    models = {kind: adapt_model(read_shipped_model(kind), kind, usable, made_of) for kind in kinds}
+    models = {kind: adapt_model(read_default_model(kind), kind, usable, made_of) for kind in kinds}
     rule = ConfidenceRule(models, precision)
     accepted = [
         answer

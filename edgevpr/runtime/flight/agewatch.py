@@ -22,11 +22,11 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 DELAYS_S = np.arange(-1.0, 6.05, 0.1)  # candidates
 
-_HISTORY_S = 60.0  # of the motion and of the matches that are compared with it
+_HISTORY_S = 60.0  # of motion and matches
 _MAX_MOTION_GAP_S = 1.0  # between two reports
 _MIN_INTERVAL_S = 0.9  # between two matches: an earlier one adds no information
 _MAX_MATCHES = 20
-_MIN_MATCHES = 4  # to estimate a delay
+_MIN_MATCHES = 4  # needed to estimate a delay
 # Largest chi-square of a delay under the prior, the usual delay of such a camera, since a delay of seconds is possible.
 # For a negative delay the deviation is multiplied by this factor, without a limit, because such delays are rare.
 _MAX_PRIOR_CHI2 = 30.0
@@ -52,10 +52,10 @@ _AGREEMENT_CHI2 = 9.0
 _MIN_LEAD_CHI2 = 6.0
 _MAX_DELAY_CHANGE_S = 0.5
 _MIN_OTHER_DELAY_S = 1.5
-_MAX_COMPARED = 12  # matches
+_MAX_COMPARED = 12  # number of earlier matches that a match is compared with
 _MAX_DELAY_SD_S = 0.3  # of a known delay
 _MAX_CHI2_PER_MATCH = 3.0  # if all have the same delay
-_MIN_PENDING_MATCHES = 8  # to accept another delay
+_MIN_PENDING_MATCHES = 8  # needed to accept another delay
 _PAST_CHI2_WEIGHT = 0.9  # of the matches before the last half minute
 _MIN_AGREEING = 2  # consecutive matches after which the old delay counts as confirmed
 _MAX_OUTLIERS = 3  # consecutive contradictions that no delay explains: then the reported motion is wrong
@@ -84,7 +84,7 @@ class Delay:
 
 
 class Comparison(Enum):
-    """A match compared with the delay of those before it. UNKNOWN: several delays fit. OUTLIER: none fits."""
+    """Comparison of a match with the delay of earlier ones. UNKNOWN: several delays fit. OUTLIER: none fits."""
 
     AGREES = auto()
     UNKNOWN = auto()

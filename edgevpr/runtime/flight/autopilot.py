@@ -47,13 +47,13 @@ class AutopilotOutput:
         self._send_fixes, self._source_sets = settings.send_fixes, SourceSets(settings.source_sets)
         self._unanswered: list[tuple[str, FixTransmission]] = []
         self._held, self._is_holding = 0, False
-        self._output = Output.STARTING  # as last reported
+        self._output = Output.STARTING  # last one reported
         self._unknown_age = Alert(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN)
-        self._delay_s = 0.0  # as last reported
+        self._delay_s = 0.0  # last one reported
 
     @property
     def summary(self) -> str:
-        """Counts of fixes and of refused messages from other systems so far, in a few words."""
+        """Short text with the counts of fixes and of refused messages from other systems so far."""
         stats = self._link.stats()
         sent = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} accepted"
         if stats.positions_sent:
@@ -296,7 +296,7 @@ def _position_fields(fix: Fix) -> dict[str, float]:
 
 
 def report_unsent(event: Recognition, why: Reason) -> FixReport:
-    """Return the report of a fix that was not sent, and why."""
+    """Return the report of a fix that was not sent for the reason `why`."""
     return FixReport(query=event.name, sent=False, why=why)
 
 

@@ -57,7 +57,7 @@ class MirrorWatch:
 
     def __init__(self, notifier: Notifier, recogniser: Recogniser) -> None:
         self._notifier, self._recogniser = notifier, recogniser
-        self._meter = QueryMeter(recogniser.meter.board)  # its own, since the flight's meter may be recorded
+        self._meter = QueryMeter(recogniser.meter.board)  # separate, because the flight's meter may be recorded
         self._misses = self._tries = self._matches = 0
         self._next_try = _MISSES_TO_TRY
 

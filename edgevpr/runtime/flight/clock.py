@@ -38,7 +38,7 @@ class Pace:
         return self._due_s - self._clock.mono_s()
 
     def record_frame(self, step_s: float | None = None) -> None:
-        """Record that a frame was taken. The next is due after `step_s` (None: by the rate), or later in proportion to
+        """Record that a frame was taken. The next is due after `step_s` (None: at the rate), or later in proportion to
         how far the rate has been lowered."""
         wait_s = 1 / self.rate_hz if step_s is None else step_s * self._requested_hz / self.rate_hz
         self._due_s = max(self._due_s + wait_s, self._clock.mono_s())

@@ -157,7 +157,7 @@ class Flight:
         }
 
     def _remarks(self) -> tuple[str | None, ...]:
-        """Return remarks for the status in addition to the counts, each in a few words (None: nothing to report)."""
+        """Return short remarks for the status, in addition to the counts (None: nothing to report)."""
         restriction = self._governing.governor.restriction
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
         return self._commands.summary, age, restriction, self._map_watch.summary, self._parts.flight_log.fault

@@ -27,7 +27,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 
 # Motions are fractions of the image's longest side. A motion of 0.012 is detected.
 MIN_MOTION = 0.03  # least motion by the aircraft that contradicts an unmoved image
-MIN_PROOF = 0.09  # sum of such motions that proves images frozen: one reset of the heading is no proof
+MIN_PROOF = 0.09  # sum of such motions that proves images frozen: a single reset of the heading does not
 _MAX_SINGLE_MOTION = 0.04  # limit for one rotation, or one repeated image
 _PROOF_WINDOW_S = 20.0
 _MIN_FROZEN_S = 2.5  # of unchanged images, or between an image and its repetition
@@ -55,7 +55,7 @@ _MAX_REMEMBERED = 300  # images; 4 MB
 _REMEMBER_INTERVAL_S = 0.5
 _MIN_THUMB_CORRELATION = 0.97  # of the coarsest copies
 _MAX_CANDIDATES = 3  # earlier images that are compared block by block
-_NEW_AFTER_UNCHANGED = 3  # new images after which the camera counts as back
+_NEW_AFTER_UNCHANGED = 3  # new images after which the camera counts as working again
 _NEW_AFTER_REPEATS = 10  # the same, after a repeated clip
 
 
@@ -127,14 +127,14 @@ class FrozenWatch:
 
     @property
     def reason(self) -> Reason | None:
-        """Why images are refused while they are frozen, else None."""
+        """Reason to refuse images while they are frozen, else None."""
         if not self.is_frozen:
             return None
         is_repeating = self._new_needed == _NEW_AFTER_REPEATS
         return Reason(ReasonCode.IMAGES_REPEATED if is_repeating else ReasonCode.IMAGES_UNCHANGED)
 
     def judge(self, frame: Frame, vehicle: Vehicle | None) -> Reason | None:
-        """Judge the next image, with the autopilot's report at its time. Return why it is refused, or None."""
+        """Judge the next image, with the autopilot's report at its time. Return the reason to refuse it, or None."""
         if vehicle and not vehicle.is_fresh(frame.t_mono_s):
             vehicle = None
         now = self._locate_image(make_coarse(frame.image), frame.t_mono_s, vehicle)

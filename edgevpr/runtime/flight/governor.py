@@ -81,7 +81,7 @@ class Governor:
 
     @property
     def restriction(self) -> str | None:
-        """Lowered settings, in a few words; None if none is lowered."""
+        """Short text with the lowered settings; None if none is lowered."""
         now, full = self.setting, self._settings[0]
         parts = (
             f"{now.rate_hz:g} of {full.rate_hz:g} Hz" if now.rate_hz != full.rate_hz else "",
@@ -119,7 +119,7 @@ class Governor:
         return None
 
     def _measure_held_s(self, name: str, now_s: float, holds: bool) -> float:
-        """Record whether the condition `name` holds now; return for how many seconds it has held without a break."""
+        """Record whether the condition `name` holds now; return the seconds for which it has held continuously."""
         if not holds:
             self._since_s.pop(name, None)
             return 0.0

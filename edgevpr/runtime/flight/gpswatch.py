@@ -37,10 +37,10 @@ class GpsWatch:
     when they agree again. Every comparison is sent to the autopilot, and navigation does not use a GPS that is wrong.
 
     GPS `is_wrong` after three matches in a row contradict it, at different places and with about the same offset from
-    GPS; it is right again after three matches in a row agree with it. A match contradicts GPS if its offset from GPS is
-    large, or differs from the mean of earlier matches. While the aircraft hovers, the same place counts again if it
+    GPS; it is correct again after three matches in a row agree with it. A match contradicts GPS if its offset from GPS
+    is large, or differs from the mean of earlier matches. While the aircraft hovers, the same place counts again if it
     agreed with GPS before. Intermittent jamming is detected by five contradicting matches within twenty seconds, and
-    GPS stays wrong until there are fewer. `map_sd_m` is the standard deviation of the error that all matches share."""
+    GPS stays wrong until there are fewer. `map_sd_m` is the standard deviation of the error common to all matches."""
 
     def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
         self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
@@ -49,12 +49,12 @@ class GpsWatch:
         self._agreements = 0
         self._mean_error_m, self._mean_count = np.zeros(2), 0  # of the matches that agreed, and their number
         self._agreed_places: set[int] = set()  # places of the last match that agreed
-        self._reported_m = math.inf  # the distance that was last reported
+        self._reported_m = math.inf  # the distance last reported
         self._have_agreed = False  # GPS and map have agreed in this flight
         self.is_wrong = False
 
     def reset(self) -> None:
-        """Discard the offsets from GPS so far, since later matches have different errors."""
+        """Discard the offsets from GPS so far, because later matches have different errors."""
         self._opposing.clear()
         self._recent.clear()
         self._mean_error_m, self._mean_count = np.zeros(2), 0
@@ -86,7 +86,7 @@ class GpsWatch:
 
     def _judge(self, match: PositionedMatch, error_m: Doubles, sd_m: float) -> None:
         """Update the verdict on GPS with a match at `error_m` (2,) metres from it. `sd_m` is the standard deviation
-        of this offset, without the error that all matches share."""
+        of this offset, without the error common to all matches."""
         is_far = _is_beyond(error_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
         is_mean_known = self._mean_count >= _MIN_MEAN_MATCHES
         has_moved = is_mean_known and _is_beyond(error_m - self._mean_error_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)

@@ -19,7 +19,7 @@ MIN_HEIGHT_M = 1.0  # lower heights, as on the ground, are raised to this before
 
 class HeightWatch:
     """Reports once when the heights of five matches in a row contradict the reported one, and once when five agree
-    again. A match gives a height only if the lens is known. The `autopilot` (None: there is no link) gets the ratio.
+    again. A match has a height only if the lens is known. The `autopilot` (None: there is no link) receives the ratio.
 
     `image_height_m`, `autopilot_height_m`: medians over the last five matches (None: the heights agree)."""
 

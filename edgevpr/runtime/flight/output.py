@@ -12,11 +12,11 @@ from edgevpr.mavlink.receivers import extrapolate
 MATCH_PROOF_S = 5.0  # a match within this time proves our position
 _MAX_INNOVATION_RATIO = 1.0  # innovation over the gate of the autopilot's filter
 _MIN_REFUSED_S = 3.0
-_MAX_ESTIMATE_ERROR_M = 15.0  # distance between the autopilot's estimate and a good receiver; at least this
+_MAX_ESTIMATE_ERROR_M = 15.0  # of the autopilot's estimate relative to a good receiver, or the next if larger
 _MAX_ESTIMATE_ERROR_SD = 4.0
 _MIN_DRIFT_OFF_S = 2.0
 _MIN_STEADY_S = 3.0
-INFLUENCE_S = 10.0  # how long our last position may affect the estimate of an autopilot that has GPS
+INFLUENCE_S = 10.0  # our last position may affect the estimate of an autopilot with GPS for this long
 
 
 class Output(Enum):

@@ -39,7 +39,7 @@ class Path:
         return self._points[-1]
 
     def compute_offset_m(self, lat_deg: float, lon_deg: float) -> Doubles:
-        """Return the metres (2,), east and north, from the origin to a position."""
+        """Return the offset (2,) of a position from the origin, metres east and north."""
         return np.array(offset_m(self.origin.lat_deg, self.origin.lon_deg, lat_deg, lon_deg))
 
     def add_velocity(self, t_s: float, velocity_m_s: Doubles) -> float:

@@ -43,7 +43,7 @@ _MAX_RESIDUAL_SD = 4.0  # of an inlier
 _MIN_TRUSTED_FRACTION = 0.1
 _MAX_HALF_SD_M = 2.0
 _MAX_HALVES_SD = 4.0
-_MAX_TRUSTED_M = 12.0  # a match closer to GPS, given the mount, is no reason to distrust GPS
+_MAX_TRUSTED_M = 12.0  # a match closer to GPS, given the mount, does not count against GPS
 _HUBER_ITERATIONS = 6
 _REJECTION_ITERATIONS = 3
 _HUBER_SIGMA = 2.0
@@ -52,9 +52,9 @@ _RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))  # of a Rayleigh distribution with
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySample:
-    """A match `offset_m` (2,) metres east and north of GPS: the product of `jacobian` (2, 6) and the parameters. The
-    variance of each axis, m2, is the sum of `independent_m2` and `correlated_m2`, an error that `correlation` samples
-    have in common. `distrusts_gps`: GPS was distrusted at that time."""
+    """A match. `offset_m` (2,), metres east and north of GPS, is the product of `jacobian` (2, 6) and the parameters.
+    The variance of each axis, m2, is the sum of `independent_m2` and `correlated_m2`, an error that `correlation`
+    samples have in common. `distrusts_gps`: GPS was distrusted at that time."""
 
     jacobian: Doubles
     offset_m: Doubles

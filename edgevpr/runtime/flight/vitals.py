@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 _REPORT_INTERVAL_S = 1.0
 _MINUTE_S = 60.0
 _CAMERA_START_TIMEOUT_S = 10.0
-# If a live camera gives no query for this long, something hangs: longer than a query takes on the slowest board, and
+# Without a query from a live camera for this long, something hangs: longer than a query takes on the slowest board, and
 # than this many intervals between queries.
 _QUERY_TIMEOUT_S = 45.0
 _QUERY_TIMEOUT_INTERVALS = 3

@@ -19,7 +19,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 MAX_FAILURES_IN_A_ROW = 10  # a single failure may be a bad frame
 MAX_BLANK_IN_A_ROW = 10  # pictures with too little texture
 
-_MIN_ON_MAP = 3  # accepted matches before the aircraft counts as over the map, and can leave it
+_MIN_ON_MAP = 3  # accepted matches before the aircraft counts as over the map, and leaving it is reported
 _MAX_MISSES = 30  # consecutive queries that are not accepted; ten are common over featureless ground
 _LOST_PROBABILITY = 0.9
 _MAX_LOST_MISSES = 10  # the same, if the place filter considers the aircraft lost in each of them

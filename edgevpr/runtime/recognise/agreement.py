@@ -26,18 +26,18 @@ from edgevpr.runtime.recognise.landmarks import Landmarks
 MIN_CONFIRMED_INLIERS = 8
 MIN_PROVEN_INLIERS = 10
 # Largest deviations from the expected shift (fraction of the longest side), rotation (degrees) and scale (a factor).
-_MAX_SHIFT_SHARE = 3.5 / 32
+_MAX_SHIFT = 3.5 / 32
 _MAX_TURN_DEG = 25.0
 _MAX_SCALE = 1.35
-_MAX_UNKNOWN_SCALE = 1.9  # the same factor if no ratio of heights is expected
+_MAX_UNKNOWN_SCALE = 1.9  # the same factor if the ratio of heights is unknown
 _SCALE_LIMITS = (0.4, 2.5)  # limits of the scale without an expectation
-_MAX_ANGLE_DEG = 30.0  # between the directions of two matching landmarks; those of ORB err by a few degrees
-_SIZE_TOLERANCE = 1.2  # one level of the image pyramid: sizes are not known more exactly
+_MAX_ANGLE_DEG = 30.0  # between the directions of matching landmarks; ORB directions are wrong by a few degrees
+_SIZE_TOLERANCE = 1.2  # one level of the image pyramid, the resolution of sizes
 
-_MAX_DIFFERENT_BITS = 64  # of 256 may differ; among unrelated landmarks about one pair in a thousand differs in so few
-_TOLERANCE_SHARE = 10 / 640  # of the longest side: about how far relief and tilt move a landmark
+_MAX_DIFFERENT_BITS = 64  # out of 256; about one in a thousand pairs of unrelated landmarks differs in no more bits
+_TOLERANCE = 10 / 640  # fraction of the longest side: typical displacement of a landmark by relief and tilt
 _BEST_MATCHES = 60  # number of best matches whose pairs each define a similarity to try
-_MIN_DISTANCE_SHARE = 0.06  # of the longest side; landmarks closer together hardly constrain the rotation
+_MIN_DISTANCE = 0.06  # fraction of the longest side; landmarks closer together hardly constrain the rotation
 _MIN_INLIERS = 3
 # Relief and tilt move neighbouring landmarks together, so this many count as one independent landmark. With this value,
 # half of the errors on aerial_caliterra and aerial_garfield28 are within the 50 % bound of the covariance.
@@ -104,7 +104,7 @@ class Agreement:
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         rotation_deg = min(self.rotation_deg, 360 - self.rotation_deg)
-        return max(map(abs, self.shift_share)) <= _TOLERANCE_SHARE and rotation_deg <= 2 and abs(self.scale - 1) <= 0.03
+        return max(map(abs, self.shift_share)) <= _TOLERANCE and rotation_deg <= 2 and abs(self.scale - 1) <= 0.03
 
 
 def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
@@ -142,11 +142,11 @@ def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | No
     if similarity is None:
         return no_agreement
     for _ in range(3):
-        is_inlier = np.abs(similarity[0] * query_points + similarity[1] - place_points) <= _TOLERANCE_SHARE
+        is_inlier = np.abs(similarity[0] * query_points + similarity[1] - place_points) <= _TOLERANCE
         if np.count_nonzero(is_inlier) < _MIN_INLIERS:
             return no_agreement
         similarity = fit_similarity(query_points[is_inlier], place_points[is_inlier])
-    is_inlier = np.abs(similarity[0] * query_points + similarity[1] - place_points) <= _TOLERANCE_SHARE
+    is_inlier = np.abs(similarity[0] * query_points + similarity[1] - place_points) <= _TOLERANCE
     inliers = int(np.count_nonzero(is_inlier))
     if inliers < _MIN_INLIERS or not _is_near(*similarity, expected):
         return no_agreement
@@ -181,7 +181,7 @@ def _find_pairs(
     direction and size under an overlay near the `expected` one. The points are complex (N,) and (M,)."""
     factor = _MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE
     expected_points = expected.turn_scale * query_points + np.complex64(complex(*expected.shift_share))
-    tolerance = _MAX_SHIFT_SHARE + np.abs(query_points) * (factor - 1 + np.radians(_MAX_TURN_DEG) / 2)
+    tolerance = _MAX_SHIFT + np.abs(query_points) * (factor - 1 + np.radians(_MAX_TURN_DEG) / 2)
     is_plausible: Bools = np.abs(expected_points[:, None] - place_points) <= tolerance[:, None].astype(np.float32)
     rotation = np.radians(query.angle_deg + expected.rotation_deg)[:, None] - np.radians(place.angle_deg)
     is_plausible &= np.cos(rotation) >= np.cos(np.radians(_MAX_ANGLE_DEG))
@@ -198,7 +198,7 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
     difference = turn_scale / expected.turn_scale
     rotation_deg, log_scale = np.abs(np.angle(difference, deg=True)), np.abs(np.log(np.abs(difference)))
     max_log_scale = np.log(_MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE)
-    is_shift_near = np.abs(shift - complex(*expected.shift_share)) <= _MAX_SHIFT_SHARE
+    is_shift_near = np.abs(shift - complex(*expected.shift_share)) <= _MAX_SHIFT
     return np.asarray((rotation_deg <= _MAX_TURN_DEG) & (log_scale <= max_log_scale) & is_shift_near)
 
 
@@ -206,7 +206,7 @@ def _find_best(query_points: Array, place_points: Array, expected: Overlay | Non
     """Return the similarity that fits the most matches, among those defined by two matches; None if none is near the
     expected overlay. The points are complex (n,), best matches first."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(query_points)), 1)
-    is_apart = np.abs(query_points[other] - query_points[one]) > _MIN_DISTANCE_SHARE
+    is_apart = np.abs(query_points[other] - query_points[one]) > _MIN_DISTANCE
     one, other = one[is_apart], other[is_apart]
     turn_scale = (place_points[other] - place_points[one]) / (query_points[other] - query_points[one])
     turn_scale = np.where(turn_scale == 0, np.finfo(float).tiny, turn_scale)  # two landmarks at one point: avoid zero
@@ -216,7 +216,7 @@ def _find_best(query_points: Array, place_points: Array, expected: Overlay | Non
         return None
     turn_scale, shift = turn_scale[is_near], shift[is_near]
     residual = np.abs(turn_scale[:, None] * query_points + shift[:, None] - place_points)
-    support = np.maximum(0, 1 - (residual / _TOLERANCE_SHARE) ** 2).sum(axis=1)
+    support = np.maximum(0, 1 - (residual / _TOLERANCE) ** 2).sum(axis=1)
     best = int(support.argmax())
     return turn_scale[best], shift[best]
 
@@ -224,7 +224,7 @@ def _find_best(query_points: Array, place_points: Array, expected: Overlay | Non
 def _estimate_variance(query_points: Array, place_points: Array, turn_scale: complex, shift: complex) -> float:
     """Return the variance of the shift along each axis, in squares of the image's longest side, from the inliers."""
     residual2 = np.abs(turn_scale * query_points + shift - place_points) ** 2
-    per_axis = max(float(residual2.sum()) / (2 * len(query_points) - 4), (_TOLERANCE_SHARE / 10) ** 2)
+    per_axis = max(float(residual2.sum()) / (2 * len(query_points) - 4), (_TOLERANCE / 10) ** 2)
     centre = query_points.mean()
     spread = float((np.abs(query_points - centre) ** 2).mean())
     # The farther the inliers are from the image's centre, the more a rotation error moves the centre.

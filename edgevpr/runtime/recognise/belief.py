@@ -8,7 +8,7 @@ The probabilities from a single query are divided by the prior they were compute
 without history, the result is that of the query alone. Three rules limit the influence of history:
 
 * Between two queries the aircraft may have left the map or be anywhere, so the newest query must always agree.
-* Pictures of the same ground are no new evidence. A hypothesis stores the evidence already counted (`credited`) for
+* Pictures of the same ground are not new evidence. A hypothesis stores the evidence already counted (`credited`) for
   the ground below it (`anchor`), and the next query there replaces it. In a hover only the newest query counts.
 * Ground outside the map that was mistaken for a place may also resemble the next places. So a place that fits the
   history raises the odds of being on the map only by a limited factor.
@@ -37,17 +37,17 @@ _ENTER_CHANCE = 0.02
 _MISS_LIKELIHOOD = 0.2  # of a query that misses the place below the aircraft, relative to a query off the map
 _RESEMBLANCE = 0.1  # probability that ground outside the map, once mistaken for a place, also resembles the next ones
 _MIN_NONE_PROBABILITY = 1e-4  # lowest probability that no candidate is correct
-_CV_PROBABILITY = 0.75  # of constant velocity
-_CV_SD = 0.5  # in spacings of the map, and as a fraction of the displacement
-# Odometry of the autopilot and of the camera: the probability that it is right, and its standard deviation in spacings
-# and as a fraction of the displacement.
+_CV_PROBABILITY = 0.75  # of motion at constant velocity
+_CV_SD = 0.5  # of this motion, in spacings of the map, and as a fraction of the displacement
+# Odometry of the autopilot and of the camera: the probability that it is correct, and its standard deviation in
+# spacings and as a fraction of the displacement.
 _REPORTED_ODOMETRY = (0.6, 0.25, 0.15)
 _VISUAL_ODOMETRY = (0.98, 0.05, 0.05)
-_REACH_SIGMAS = 1.5  # the reach in standard deviations
+_REACH_SIGMAS = 1.5  # the reach, in standard deviations of the motion
 _NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
 _SAME_POSITION_SIGMAS = 2.0  # of a position: a shorter displacement may be zero
 _MIN_WEIGHT = 1e-9  # a hypothesis with less weight is dropped
-_MIN_DIVISOR = 1e-300  # instead of zero
+_MIN_DIVISOR = 1e-300  # replaces zero
 _MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
 _MIN_SD = 0.25  # smallest standard deviation of a position, in spacings of the map
 _UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with density 1 at its mean: second axis of ordinal maps
@@ -194,7 +194,7 @@ class Belief:
         return now, lost, self._enters * self._lost + _JUMP_CHANCE * on_map
 
     def _predict_motions(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Prediction]:
-        """Return the possible motions of each hypothesis: by odometry, at constant velocity, or anywhere in reach."""
+        """Return the possible motions of each hypothesis: from odometry, at constant velocity, or anywhere in reach."""
         scale, moves = self._scale, []
         area = places * scale.cell
         widest = area / 2 if scale.is_ordinal else math.sqrt(area / math.pi)

@@ -101,7 +101,7 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
 
 
 def explain_not_calibrated(places: int) -> str:
-    """Return a sentence on why a map with this number of places is not calibrated."""
+    """Return a sentence that explains why a map with this number of places is not calibrated."""
     if places < MIN_PLACES:
         return f"not calibrated ({places} places, fewer than {MIN_PLACES}): the default confidence model is used"
     return "not calibrated: the default confidence model is used; `edgevpr map calibrate` adapts it to the map"

@@ -29,7 +29,7 @@ _MAX_LOGIT = 40.0  # beyond it, a probability is 0 or 1 in float64
 # nordland_tiny was mistaken for another, and a foreign picture for a place of aerial_swindale; with a model that is not
 # adapted to its map, also foreign pictures for the five places of grief_michigan_monthly.
 _ADAPTED_FACTOR = 0.5
-_SHIPPED_FACTOR = 0.1
+_DEFAULT_FACTOR = 0.1
 _MIN_CHANCE = 1e-15  # so that the logarithm exists
 # A chance is multiplied by this power of the fraction of rotations tried. It would be 1 if they were independent, but
 # streets and furrows have directions. Of 2,015 foreign and mirrored pictures, queried with random headings in the maps
@@ -127,7 +127,7 @@ class Model:
         """Return the lowest confidence for which the fraction `precision` (below 1) of the matches is correct. A model
         that is not adapted to its map does not reflect how similar its places look, so its threshold is higher."""
         max_wrong = 1 - precision
-        return self.scale.confidence(max_wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _SHIPPED_FACTOR))
+        return self.scale.confidence(max_wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _DEFAULT_FACTOR))
 
 
 def parse_model(fields: Mapping[str, Any]) -> Model:
@@ -138,7 +138,7 @@ def parse_model(fields: Mapping[str, Any]) -> Model:
 
 
 @lru_cache
-def read_shipped_model(kind: str) -> Model:
+def read_default_model(kind: str) -> Model:
     """Return the default model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = find_shipped("models") / f"confidence_{kind}.json"
     try:

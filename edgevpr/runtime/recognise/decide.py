@@ -46,7 +46,7 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.relief import Relief
 from edgevpr.runtime.recognise.tilted import measure_again
 
-_MAX_SAME_GROUND = 12  # places that may show the same ground: as many overlap on kite_ochota, which has no positions
+_MAX_SAME_GROUND = 12  # places tried: this many overlap on kite_ochota, which has no positions
 # Votes of a place elsewhere, relative to the best place, to count as unshifted. With an on-screen display, nearly all
 # places have 0.15 to 0.9; over smooth ground some are unshifted by chance, with up to 0.065.
 _MIN_UNSHIFTED_VOTES_RATIO = 0.15
@@ -66,7 +66,7 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchSettings:
-    """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
+    """Settings of the recogniser. `candidates` places are compared (None: all, fully; see `places.retrieve.compare`).
     `verify` enables the landmark check. With `all_evidence`, landmarks are compared even where they decide nothing, to
     fit a model. The accuracy of a position is never below `min_accuracy_m` (1 sigma)."""
 

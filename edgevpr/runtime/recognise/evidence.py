@@ -49,7 +49,7 @@ CHANCE_SHARE = 0.07  # reached by pictures of ground outside the map; used if th
 SMALL_LEAD = math.log(1.5)
 _MIN_LEAD = math.log(1.05)
 # Ahead, the largest advantage in rank that the regions of another place may have. Chosen on corridor, where one match
-# next to the right places was accepted.
+# next to the correct places was accepted.
 _MAX_RANK_GAP = 0.1
 _MIN_PROOF = math.log(2)
 # A place that has a twin must lead by this factor. In thumbs_essex, the lift door of another floor led by 2 when it was

@@ -1,5 +1,5 @@
 """Networks of the gate, each with a card: one predicts the memorability of the parts of a frame (thesis 3.2.1), the
-other, an object detector, finds the pixels that show nothing movable (thesis 3.2.2).
+other, an object detector, finds the pixels without movable objects (thesis 3.2.2).
 
 `models/recipes/train_matchability.py` trains a network with another definition of memorability: how likely a crop is to
 be found again in another image.
@@ -21,9 +21,9 @@ from edgevpr.core.errors import ModelError
 from edgevpr.techniques.card import Card, InputRule
 from edgevpr.techniques.session import compute_fill_fractions, open_session, prepare_input, run_outputs
 
-CROPS = 5  # along each side; the thesis's C is 5x5
+CROPS = 5  # along each side: C in the thesis is 5x5
 _TEST_SEED = 7
-_STRIDES_PX = (8, 16, 32)  # of the grids of yolox
+_STRIDES_PX = (8, 16, 32)  # cell sizes of the three YOLOX grids
 _MAX_LOG = 20.0  # of the side of a box in cells; a larger one would overflow the exponential
 
 Decoded = tuple[Floats, Floats]

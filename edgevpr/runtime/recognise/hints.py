@@ -35,7 +35,7 @@ _MAX_HEIGHTS = 5  # number of newest matches whose heights are compared with the
 _MIN_MASS = 0.99
 _AREA_SD = 4.0
 _AREA_MARGINS = 5.0
-# Tag field and positions.csv columns required by each known field. Without any height, the map's is used.
+# Tag field and positions.csv columns required by each known field. If no height is recorded, the map's is used.
 _REQUIRED_FIELDS = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
 
@@ -239,7 +239,7 @@ class Prior(RecordedPrior):
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
         """Store the position from the place filter (None: unknown), with the probability `mass` that the aircraft is
-        near it. It is used until the next certain one, or for a minute."""
+        near it. It is used until the next probable position, or for a minute."""
         if estimate and mass >= _MIN_MASS:
             east_m2, _, north_m2 = estimate.covariance_m2
             self._estimate = Reach(estimate.position, _AREA_SD * math.sqrt(east_m2 + north_m2)), t_mono_s
@@ -257,7 +257,7 @@ def parse_known_fields(text: str | None) -> tuple[str, ...]:
 def explain_why_unusable(
     known: Collection[str], queries: Collection[GeoTag], places: Collection[GeoTag] | Collection[Place], sequence: int
 ) -> str | None:
-    """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if any query can.
+    """Return a sentence that explains why no query can use the hints in `known` (see `RecordedPrior`), else None.
     `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
         return (

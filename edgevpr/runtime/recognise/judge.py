@@ -19,7 +19,7 @@ from edgevpr.places.ranking import Ranking, margin, outside_neighbourhood
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.calibration import MapCalibration
-from edgevpr.runtime.recognise.confidence import Model, read_shipped_model
+from edgevpr.runtime.recognise.confidence import Model, read_default_model
 from edgevpr.runtime.recognise.evidence import Evidence, LookAlikes, list_evidence_kinds
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.perspective import ObservedTilt
@@ -154,7 +154,7 @@ def make_accept_rule(
     technique: Technique, config: MatchConfig, length: int = 1, calibration: MapCalibration | None = None
 ) -> AcceptRule:
     """Return the rule for a technique: by confidence if there is a model for its evidence, otherwise by its own limits.
-    Limits in the configuration take precedence. `calibration` is that of the map (None: use the shipped models). A
+    Limits in the configuration take precedence. `calibration` is that of the map (None: use the default models). A
     sequence of `length` queries is judged by limits; its margin is that of one query over the square root of its length
     (at most 10, because queries of the same ground are not independent)."""
     kinds = list_evidence_kinds(technique.spec) if length == 1 else ()
@@ -163,7 +163,7 @@ def make_accept_rule(
     if min_margin < 1:  # a margin of 1 or more accepts nothing, even in sequences
         min_margin /= math.sqrt(min(length, _MAX_INDEPENDENT))
     map_models = calibration.models if calibration else {}
-    models = {kind: map_models.get(kind) or read_shipped_model(kind) for kind in kinds}
+    models = {kind: map_models.get(kind) or read_default_model(kind) for kind in kinds}
     return AcceptRule(
         min_score=min_score if config.min_score is None else config.min_score,
         min_margin=min_margin if config.min_margin is None else config.min_margin,
@@ -270,7 +270,7 @@ def _check_landmarks(agreement: Agreement, score: float) -> Reason | None:
 
 
 def is_unshifted(match: FineMatch) -> bool:
-    """Return True if a match has hardly any shift, rotation or height difference."""
+    """Return True if a match has almost no shift, rotation or height difference."""
     if match.rotation_deg is None or match.shift_cells is None:
         return False
     rotation_deg = abs(wrap_deg(match.rotation_deg))

@@ -27,12 +27,12 @@ _VOTE_SD = 0.016
 _LANDMARK_SD = 0.008
 _POSE_SD = 0.03  # due to scale and rotation of a place's pose, as a fraction of the length of a shift
 _MEAN_VARIANCE_RATIO = 0.25  # variance of the mean of the votes, relative to that of a single vote
-_MIN_SCORE_RATIO = 0.5  # of the best score: matches with at least this score are also used
+_MIN_SCORE_RATIO = 0.5  # matches with at least this fraction of the best score are also used
 _MAX_DIFFERENCE_SD = 4.0  # places whose positions differ by more are not used
-_MAX_POSITION_SPREAD = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
+_MAX_POSITION_SPREAD = 0.2  # fraction of the footprint: if positions are farther apart, one of the places is wrong
 _MAX_CONTRADICTION_RATIO = 0.4  # sum of the scores of contradicting places, relative to agreeing ones
 MAX_PLACES_CHECKED = 12  # this many show the same ground in a dense map
-_MAX_PLACES_AVERAGED = 5  # of these determine the position
+_MAX_PLACES_AVERAGED = 5  # number of these that determine the position
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +58,7 @@ class Located:
 
     @property
     def accuracy_m(self) -> float:
-        """Standard deviation in the direction of the largest one, metres."""
+        """Standard deviation along the worst direction, metres."""
         var_east, cov, var_north = self.covariance_m2
         mean, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
         return math.sqrt(mean + half)

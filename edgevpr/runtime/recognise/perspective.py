@@ -20,25 +20,25 @@ from edgevpr.frames.level import View
 
 _log = logging.getLogger(__name__)
 _MIN_LANDMARKS = 12
-_POINT_SD = 2.5 / 640  # of a landmark, as a fraction of the longest side
+_POINT_SD = 2.5 / 640  # standard deviation of a landmark, as a fraction of the longest side
 _SHEAR_SD = 0.01
 TYPICAL_FOCAL = 0.77  # 66 degrees along the longest side
 _UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # if too few regions agree to measure a tilt
-_CLEAR_SD = 3.0  # of a tilt beyond the reported one
+_CLEAR_SD = 3.0  # standard deviations by which a clear tilt exceeds the reported one
 _CLEAR_TILT = math.tan(math.radians(5.0))
-# Of a slope: the pictures of places are tilted by a few degrees, and relief also looks like a tilt.
+# Error of a slope: the pictures of places are tilted by a few degrees, and relief also looks like a tilt.
 _PLACE_SLOPE_SD = 0.1
 # Relative difference of scales with direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
 # those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
 _CLEAR_STRETCH = 0.075
-_TILT_RELATIVE_SD = 0.3  # of a tilt: it adds to the claimed error, but cannot refuse an image at 30 degrees
-# Of a mean over several matches: slopes of the ground, which a map of an orthophoto does not contain. Of each match:
+_TILT_RELATIVE_SD = 0.3  # relative to the tilt: it adds to the claimed error, but cannot refuse an image at 30 degrees
+# Errors of the mean over matches: slopes of the ground, which a map of an orthophoto does not contain; and of a match:
 # the tilt of the place's image, as in a map made with the same camera.
 _COMMON_TILT_SD = math.tan(math.radians(2.0))
 _SINGLE_TILT_SD = math.tan(math.radians(4.0))
 _MAX_TILT = math.tan(math.radians(60.0))  # a larger tilt is a wrong fit
-_COMMON_RELATIVE_SD = 0.15  # of a tilt: large tilts, which are mostly wrong, count little
-_DECAY = 0.98  # of earlier matches, per match: a gimbal may move
+_COMMON_RELATIVE_SD = 0.15  # relative to the tilt: large tilts, which are mostly wrong, count little
+_DECAY = 0.98  # of the weight of earlier matches, per match: a gimbal may move
 # Relief moves neighbouring landmarks together, so this many count as one. The place's own picture is tilted too.
 _CORRELATED_LANDMARKS = 5.0
 _PLACE_TILT_SD = math.tan(math.radians(0.5))
@@ -80,7 +80,7 @@ class ObservedTilt:
 
     def get_sd(self, is_reported: bool) -> float:
         """Return the standard deviation of the tilt used for levelling, as a tangent. A reported tilt is trusted unless
-        the pictures clearly contradict it. An unreported tilt is wrong by all of it, plus the error of this
+        the pictures clearly contradict it. If no tilt is reported, the error is the whole tilt plus that of this
         measurement: if few regions agree, they are close together and show too small a tilt (tilt_ariel)."""
         if is_reported:
             return math.hypot(self.tangent, self.sd) if self.is_clear else 0.0
@@ -115,7 +115,7 @@ class CommonTilt:
 
     @property
     def mean(self) -> ObservedTilt:
-        """The mean so far."""
+        """The mean tilt so far."""
         if not self._weight:
             return ObservedTilt(0.0, _UNKNOWN_TILT_SD)
         return ObservedTilt(abs(self._weighted) / self._weight, self._weight**-0.5, _COMMON_TILT_SD)

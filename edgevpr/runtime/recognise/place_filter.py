@@ -25,10 +25,10 @@ from edgevpr.runtime.recognise.odometry import OdometryStep
 
 _TWIN_RATIO = 0.5  # with this fraction of the best place's votes, a twin is equally likely (`Evidence.has_twin`)
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
-_SHARPNESS = 10.0  # the odds of two places are the ratio of their votes to this power
-_OTHERS_CORRECT_FRACTION = 0.7  # how often the correct place is among the others if the best one is wrong
+_SHARPNESS = 10.0  # the odds of two places are this power of the ratio of their votes
+_OTHERS_CORRECT_FRACTION = 0.7  # of cases in which the correct place is among the others if the best is wrong
 _MAX_PROPOSED = 20  # largest number of places that one query proposes
-# Largest distance that counts as one position, in places and in footprints; and what counts as more likely than not.
+# Largest distance that counts as one position, in places and in footprints; and the probability of a majority.
 _NEAR_PLACES = 3.0
 _NEAR_FOOTPRINT = 0.25
 _MIN_MAJORITY = 0.5
@@ -203,7 +203,7 @@ def _make_proposals(
     """Return the index rows, int (K,), of the places that a query proposes, and the proposals for the belief."""
     slots: Ints = np.array(ranking.compared_slots[:_MAX_PROPOSED])
     positions = geometry.positions(slots, index)
-    # Without a located match only the place is known, not where in its picture the aircraft is.
+    # Without a located match only the place is known, not the aircraft's position in its picture.
     spread = geometry.spread if located else max(geometry.spread, geometry.scale.near)
     covariance = np.tile((1.0 if geometry.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
     heading_deg = np.full(len(slots), np.nan)

@@ -58,7 +58,7 @@ class Recogniser:
         self.technique, self.candidates = encoder.technique, settings.candidates
         self._settings, self._odometry, self._place_filter = settings, odometry, place_filter
         self._prior = prior or RecordedPrior()
-        self._left_out_reported = 0  # places
+        self._left_out_reported = 0  # number of unreadable places reported so far
         self._layers = matcher.layers or read_layers(place_map)
         self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
         # Places closer together than this show the same ground, so they are not rivals.
@@ -126,7 +126,7 @@ class Recogniser:
         return replace(self._make_event(frame, vehicle, odometry_step=odometry_step, failure=failure), picture=picture)
 
     def report_unread(self, error: Exception) -> Recognition:
-        """Return the event of a frame that could not even be read."""
+        """Return the event of a frame that could not be read."""
         self.meter.begin()
         return self._make_event(None, None, failure=error)
 

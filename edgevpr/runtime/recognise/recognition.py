@@ -39,7 +39,7 @@ class Recognition:
     confidence: float | None = None  # that the match is correct, from the evidence (None: judged by limits)
     track: TrackEstimate | None = None  # result of the place filter
     accepted: bool = False  # `best` is accepted as the place
-    reason: Reason = NOT_SEARCHED  # why or why not
+    reason: Reason = NOT_SEARCHED  # of the acceptance or refusal
     lacks_texture: bool = False  # too little to recognise a place; searched only to continue a sequence
     failed: bool = False  # the frame, a place or the technique was unusable
     map_lost: bool = False  # the whole map cannot be read

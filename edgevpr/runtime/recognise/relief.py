@@ -9,7 +9,7 @@ from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG, View
 # errors of its positions exceed the variation of its heights by that factor.
 UNKNOWN_HEIGHT_SD = 0.13
 _SCATTER_FACTOR = 1.5
-_UNKNOWN_WEIGHT = 3.0  # weight of this value, in matches
+_UNKNOWN_WEIGHT = 3.0  # weight of UNKNOWN_HEIGHT_SD, in matches
 _DECAY = 0.98  # of the weight of earlier matches: the ground changes along the flight
 _MIN_TANGENT = math.tan(math.radians(MAX_TILT_UNLEVELLED_DEG))  # the positions from level images contain this error
 

@@ -23,7 +23,7 @@ from edgevpr.techniques.entropy import compute_filled_bins
 
 MAX_ENTROPY = float(np.log2(81) / 8)  # entropy of a disc of 81 pixels, all different, divided by 8 bits
 GAP_FRAMES = 20  # if none of this many frames passes, the thresholds are lowered
-THRESHOLD_STEP = 0.03  # by which they are lowered in each step
+THRESHOLD_STEP = 0.03  # size of the steps in which they are lowered
 _MIN_FRAMES = 8  # needed to compute the usual entropy
 _MAX_FRAMES = 100
 # A tenth of a normal distribution is more than this many differences of its 90th and 75th percentiles below the 75th.

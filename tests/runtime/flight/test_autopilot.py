@@ -106,7 +106,7 @@ def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, capl
     link.send_fix = lambda fix: 1 / 0
     lines = make_flight().fly(FakeSource(pictures(2), clock))
     assert len(of_kind(lines, "query")) == 2
-    assert sum("could not be informed" in record.message for record in caplog.records) == 2
+    assert sum("could not be sent to the autopilot" in record.message for record in caplog.records) == 2
 
 
 def test_blank_images_are_reported_once_after_ten_and_so_is_the_ground_again(make_flight, clock, link):

@@ -22,12 +22,12 @@ from edgevpr.runtime.recognise.calibration import (
     read_calibration_for,
     require_usable,
 )
-from edgevpr.runtime.recognise.confidence import parse_model, read_shipped_model
+from edgevpr.runtime.recognise.confidence import parse_model, read_default_model
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
-SHIPPED = {kind: read_shipped_model(kind) for kind in ("ahead", "ahead_proven")}
+SHIPPED = {kind: read_default_model(kind) for kind in ("ahead", "ahead_proven")}
 OWN = replace(SHIPPED["ahead"], made_of="this map")
 FOUND = MapCalibration(
     models={"ahead": OWN},
@@ -115,7 +115,7 @@ def test_flight_uses_the_default_model_and_reports_a_damaged_calibration(path, t
 
 @pytest.mark.parametrize("kind", MAP_FIGURES)
 def test_default_model_gives_a_probability_for_any_evidence(kind):
-    model = read_shipped_model(kind)
+    model = read_default_model(kind)
     require_usable(kind, model)
     assert parse_model(json.loads(json.dumps(asdict(model)))) == model
     evidence = dict.fromkeys(MAP_FIGURES[kind] + PLACE_FIGURES[kind], 0.0)

@@ -11,7 +11,7 @@ from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.ranking import Ranking
 from edgevpr.runtime.recognise.calibration import require_usable
-from edgevpr.runtime.recognise.confidence import read_shipped_model
+from edgevpr.runtime.recognise.confidence import read_default_model
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
     AHEAD_PROVEN,
@@ -177,10 +177,10 @@ def test_gather_evidence_is_none_if_nothing_was_compared():
 
 
 def test_require_usable_refuses_a_model_of_other_evidence():
-    model = read_shipped_model(DOWN_BARE)
+    model = read_default_model(DOWN_BARE)
     require_usable(DOWN, model)
     with pytest.raises(ValueError, match="landmarks"):
-        require_usable(DOWN_BARE, read_shipped_model(DOWN))
+        require_usable(DOWN_BARE, read_default_model(DOWN))
     with pytest.raises(ValueError, match="sideways"):
         require_usable("sideways", model)
     named = replace(model.of_place, names=("colour", *model.of_place.names[1:]))
@@ -191,6 +191,6 @@ def test_require_usable_refuses_a_model_of_other_evidence():
 def test_chance_is_lower_with_a_known_heading():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
     all_of_them, known = (looked_down(matches, agreed(3), tried=tried).figures() for tried in (1.0, 1 / 8))
-    model = read_shipped_model(DOWN)
+    model = read_default_model(DOWN)
     assert 0 < model.chance(known) == pytest.approx(model.chance(all_of_them) / 4)
     assert model.confidence(known) > model.confidence(all_of_them)
