@@ -159,7 +159,7 @@ class FakeLink:
         self._acks: Counter[str] = Counter()
         self._is_under_way, self._wish = False, None
 
-    def turn(self, what: str) -> AbstractContextManager[None]:
+    def take_turn(self, name: str) -> AbstractContextManager[None]:
         return nullcontext()
 
     def send(self, *outgoing) -> None:

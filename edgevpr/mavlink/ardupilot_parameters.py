@@ -68,7 +68,7 @@ _VISION_SET_CHANGES = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1"
 
 def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
     """Choose the channel for an ArduPilot: GPS_INPUT or ODOMETRY if its parameters are set for it, else command 43003.
-    `parameters`: the values by name, without parameters that the autopilot does not have.
+    `parameters`: the values by name, without parameters that the autopilot lacks.
 
     A plane without GPS dead-reckons for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
     Without GPS and optical flow, a copter lands within seconds and a rover stops, even if they receive single fixes.

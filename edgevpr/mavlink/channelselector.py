@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 class ChannelSelector:
     """Requests an autopilot's version and the parameters of its table, and chooses the channel.
 
-    Unanswered requests are repeated after a second or, while nothing at all is answered, after growing pauses. Known
+    Unanswered requests are repeated after a second or, while no request is answered, after growing pauses. Known
     parameters are requested again, one every two seconds, and values that arrive unrequested are also used. After a
     change the channel is chosen again. Old firmware does not answer requests for a parameter that it lacks. Such a
     parameter counts as absent after four rounds with answers for others, or more on a link that loses messages.

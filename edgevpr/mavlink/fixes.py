@@ -69,7 +69,7 @@ class FixTransmission:
 class Fixes:
     """The fixes of one link: queued ones, and those that await an answer. Counts fixes `dropped` (too old or too many),
     `withheld` (by `find_objection` or a pause) and `unanswered`. `refusal`: reason of the autopilot's last refusal
-    (None: it has refused none)."""
+    (None: no refusal)."""
 
     def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda *_: None) -> None:
         self._announce = announce

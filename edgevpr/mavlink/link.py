@@ -64,7 +64,7 @@ class Link:
         self, address: LinkAddress, settings: LinkSettings, turns: Turns | None = None, drive: DriverMaker = PortDriver
     ) -> None:
         self.turns = turns or Turns(settings.clock)
-        with self.turn("begin"):
+        with self.take_turn("begin"):
             self.conversation = Conversation(settings, self.turns.now_s)
         self._driver = drive(address, self.conversation, self.turns)
 
@@ -73,7 +73,7 @@ class Link:
         missing device or server is not such a fault: `stats` gives the reason."""
         self._driver.start()
 
-    def turn(self, name: str) -> AbstractContextManager[None]:
+    def take_turn(self, name: str) -> AbstractContextManager[None]:
         """Context manager: take exclusive use of the link, whose clock stands still meanwhile (see `Turns`)."""
         return self.turns.take_turn(name)
 
@@ -90,32 +90,32 @@ class Link:
             self.conversation.announce(severity, text, topic)
 
     def accept_commands(self) -> None:
-        with self.turn("offer"):  # recordings of earlier flights use this name, and that of `take_command`
+        with self.take_turn("offer"):  # recordings of earlier flights use this name, and that of `take_command`
             self.conversation.requests.is_flying = True
 
     def take_interim_fixes(self) -> list[FixTransmission]:
-        with self.turn("take_between"):
+        with self.take_turn("take_between"):
             return self.conversation.take_interim_fixes()
 
     def take_command(self) -> CommandRequest | None:
-        with self.turn("take_wishes"):
+        with self.take_turn("take_wishes"):
             return self.conversation.requests.take()
 
     def set_health(self, health: Health) -> None:
-        with self.turn("set_health"):
+        with self.take_turn("set_health"):
             self.conversation.set_health(health)
 
     def request_position(self) -> None:
-        with self.turn("want_position"):
+        with self.take_turn("want_position"):
             self.conversation.request_position()
 
     def vehicle(self) -> Vehicle | None:
         """Return the last report of the vehicle; None before the first one, or if the last one had no position."""
-        with self.turn("vehicle"):
+        with self.take_turn("vehicle"):
             return self.conversation.autopilot.vehicle
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
-        with self.turn("vehicle_at"):
+        with self.take_turn("vehicle_at"):
             return self.conversation.predict_vehicle(t_mono_s)
 
     @property
@@ -124,11 +124,11 @@ class Link:
 
     def is_alive(self) -> bool:
         """Return True if a fix can be sent now: the port is connected and the autopilot's heartbeat is recent."""
-        with self.turn("listens"):
+        with self.take_turn("listens"):
             return self._driver.state()[0] and self.conversation.autopilot.is_alive(self.turns.now_s())
 
     def stats(self) -> LinkStats:
-        with self.turn("stats"):
+        with self.take_turn("stats"):
             conversation, autopilot, fixes = self.conversation, self.conversation.autopilot, self.conversation.fixes
             connected, trouble = self._driver.state()
             return LinkStats(
@@ -152,7 +152,7 @@ class Link:
 
     def close(self) -> None:
         """Send queued messages and wait for answers to fixes, for at most half a second each, then close the port."""
-        with self.turn("close"):
+        with self.take_turn("close"):
             self.conversation.texts.remove_pauses()
         self._driver.close()
 
@@ -166,6 +166,6 @@ class Link:
     @contextmanager
     def _send_turn(self, name: str) -> Iterator[None]:
         """Context manager: take a turn, then wake the driver's thread."""
-        with self.turn(name):
+        with self.take_turn(name):
             yield
         self._driver.wake()

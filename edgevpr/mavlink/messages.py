@@ -34,9 +34,9 @@ class Health(IntEnum):
     """State of this companion computer, reported in its heartbeat (MAV_STATE)."""
 
     BOOT = mavlink.MAV_STATE_BOOT
-    STANDBY = mavlink.MAV_STATE_STANDBY  # paused from the ground
+    STANDBY = mavlink.MAV_STATE_STANDBY  # paused by a ground station
     ACTIVE = mavlink.MAV_STATE_ACTIVE
-    CRITICAL = mavlink.MAV_STATE_CRITICAL  # running but not working: no frames arrive, or the main loop hangs
+    CRITICAL = mavlink.MAV_STATE_CRITICAL  # not working: no frames arrive, or the main loop hangs
 
 
 class Severity(IntEnum):

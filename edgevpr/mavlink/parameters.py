@@ -123,13 +123,13 @@ def _decide_to_wait(missing: tuple[str, ...]) -> Decision:
 
 
 def require(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
-    """Make a rule whose wrong values make our positions dangerous to an aircraft that would be safe without them:
+    """Make a rule whose wrong values make our positions dangerous to an aircraft that is safe without them:
     nothing may be sent then. `label`: defaults to the name of the first parameter."""
     return replace(recommend(channels, right, check, why, label), is_dangerous=True)
 
 
 def recommend(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
-    """Make a rule whose wrong values only make our positions useless, or weak."""
+    """Make a rule whose wrong values only make our positions useless or less useful."""
     label = label or check.names[0]
     return ParameterRule(label=label, channels=channels, is_dangerous=False, right=right, check=check, why=why)
 

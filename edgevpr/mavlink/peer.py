@@ -21,7 +21,7 @@ from edgevpr.mavlink.vehicle import MAX_FILTER_REPORT_AGE_S, Attitude, Attitudes
 from edgevpr.mavlink.wire import Message, mavlink
 
 MAX_GPS_DISAGREEMENT_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
-MAX_SPEED_M_S = 150.0  # ground speed; small aircraft are never faster, so such a report is wrong
+MAX_SPEED_M_S = 150.0  # ground speed; small aircraft are never faster, so a faster report is wrong
 _MIN_HPA = 300.0  # air pressure at any flight altitude
 _MAX_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
@@ -127,7 +127,7 @@ class Listener:
 
 
 class Autopilot:
-    """The state of the autopilot and its vehicle, from the messages of our autopilot, which `identity` selects.
+    """The state of our autopilot and its vehicle, from the messages of the sender that `identity` selects.
     `component_id`: our component id. `system_id`: system id of the autopilot (None: accept the first one)."""
 
     def __init__(self, component_id: int, system_id: int | None, listener: Listener, announce: Announce) -> None:

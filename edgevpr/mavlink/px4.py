@@ -16,7 +16,7 @@ from edgevpr.mavlink.wire import Message, mavlink
 _FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 _SENSOR_TIMEOUT_S = 6.0  # after our last message 296, whose flag PX4 keeps set for 5 s
-_VISION_TIMEOUT_S = 1.0  # ODOMETRY has a flag of its own, so only the end of our messages must be detected
+_VISION_TIMEOUT_S = 1.0  # ODOMETRY has its own flag, so only the end of our messages must be detected
 _MIN_UNUSED_S = 2.0  # PX4 must not use a receiver with a fix for this long: the fix may be new or just lost
 _SENDING_TIMEOUT_S = 1.0
 # A recovered receiver must be steady for this long before we stop sending: it may be intermittent.
@@ -27,7 +27,7 @@ _MAX_PAUSE_S = 240.0
 
 class Px4Fusion:
     """Infers whether PX4 `uses_gps` while a receiver has a fix: it does not if EKF2_GPS_CTRL=0, or if it rejects GPS.
-    `used` and `unused` count its reports while our positions are sent, by whether it fuses them."""
+    `used` and `unused` count the reports, while our positions are sent, in which PX4 fuses them and does not."""
 
     def __init__(self) -> None:
         self.uses_gps = True
@@ -86,7 +86,7 @@ class Px4Fusion:
             is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S
             self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_trusted
         elif not takes_velocity:
-            self._infer_gps_use(False, now_s)  # PX4 does not use the GPS that we stopped sending for
+            self._infer_gps_use(False, now_s)  # PX4 does not use GPS although we stopped sending
 
     def _infer_gps_use(self, is_fusing: bool, now_s: float) -> None:
         """Infer whether PX4 uses GPS while it uses none of our positions: it does if it fuses a position."""

@@ -1,4 +1,4 @@
-"""Requests to an autopilot before the flight, for `edgevpr check` and `doctor`. They change none of its settings."""
+"""Requests to an autopilot before the flight, for `edgevpr check` and `doctor`, which do not change its settings."""
 
 import select
 import statistics
@@ -157,7 +157,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         return True
 
     def _send(self, message: Message) -> None:
-        """Send a message. Bytes that a full port does not accept are lost, which is why requests are repeated."""
+        """Send a message. Bytes that a full port does not accept are lost, so requests are repeated."""
         self.signing.stamp(self._packer)
         self._port.write(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256

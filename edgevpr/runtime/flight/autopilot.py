@@ -38,7 +38,7 @@ _log = logging.getLogger(__name__)
 class AutopilotOutput:
     """Sends fixes and other messages over an open link: a match as a fix if the `navigator` advises so; a dry run
     only omits the sending. `cores` is the number of the board's cores. State shared with the link's thread is accessed
-    only in turns (`Link.turn`)."""
+    only in turns (`Link.take_turn`)."""
 
     def __init__(
         self, link: Link, navigator: Navigator, notifier: Notifier, *, settings: MavlinkConfig, cores: int, clock: Clock
@@ -76,7 +76,7 @@ class AutopilotOutput:
         """Return the state of the link for the status: `trouble`, why the port could not be opened or was lost (None:
         data arrives); `autopilot`, the system id of the live autopilot (None: none); `channel`, the name of the
         position channel; `fixes`, a summary; and `accuracy_m` of our position."""
-        with self._link.turn("state"):
+        with self._link.take_turn("state"):
             stats = self._link.stats()
             return {
                 "trouble": stats.trouble,
@@ -89,7 +89,7 @@ class AutopilotOutput:
     def log_answers(self) -> None:
         """Write a log line "answer" for each fix that was answered, timed out, or was dropped before it was sent,
         since the last call; and a line "between" for each fix that was sent between two matches."""
-        with self._link.turn("answers"):
+        with self._link.take_turn("answers"):
             for transmission in self._link.take_interim_fixes():
                 self._notifier.log("between", t_sent_s=transmission.t_sent_s, **_position_fields(transmission.fix))
             # An answer can arrive a moment before the link has recorded that the fix was sent.
@@ -111,7 +111,7 @@ class AutopilotOutput:
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
         """Send the fix of an event, if any, and its figures. Return the event with the report of its
         fix, and its accuracy in flight. `used_mah` is the charge that the board has drawn so far."""
-        with self._link.turn("use"):
+        with self._link.take_turn("use"):
             fix, transmission = None, None
             if event.accepted:
                 event = self._navigator.report_accuracy(event)
@@ -121,7 +121,7 @@ class AutopilotOutput:
             is_alive = self._link.is_alive()
         if transmission and is_alive:
             transmission.wait(_MAX_SEND_WAIT_S)
-        with self._link.turn("use of its fix"):
+        with self._link.take_turn("use of its fix"):
             if transmission:
                 sent, why, answer = transmission.sent, transmission.why, transmission.answer
                 if sent is not False:  # an unsent fix gets no answer; the log line of its query has the reason
@@ -133,13 +133,13 @@ class AutopilotOutput:
 
     def correct_age(self, frame: Frame) -> Frame:
         """Return a frame with the hidden delay of the camera subtracted from its time."""
-        with self._link.turn("age of a frame"):
+        with self._link.take_turn("age of a frame"):
             return self._navigator.age.correct(frame)
 
     def check_age(self, event: Recognition) -> Recognition:
         """Return the event of a match, without the match if the age of its picture is unknown. Report when this begins
         and ends, and the delay that is corrected."""
-        with self._link.turn("age"):
+        with self._link.take_turn("age"):
             age = self._navigator.age
             age.judge(event)
         self._unknown_age.update(age.is_unknown)
@@ -164,12 +164,12 @@ class AutopilotOutput:
 
     def add_motion(self, event: Recognition) -> None:
         """Pass the odometry of a picture that is not a query to the navigator."""
-        with self._link.turn("saw"):
+        with self._link.take_turn("saw"):
             self._navigator.handle_frame(event, is_query=False)
 
     def needs_motion_frames(self) -> bool:
         """Return True if odometry between matches is useful, because the position depends on matches."""
-        with self._link.turn("wants strides"):
+        with self._link.take_turn("wants strides"):
             return not self._navigator.has_gps
 
     def _send_figures(self, event: Recognition, used_mah: float) -> None:
@@ -186,25 +186,25 @@ class AutopilotOutput:
         """Send the distance from GPS to a match. While GPS `is_wrong`, because it contradicts the map,
         the navigator does not use it. Unless they `have_agreed` before, the map is equally likely to be wrong: then GPS
         is used, and no position is sent."""
-        with self._link.turn("gps"):
+        with self._link.take_turn("gps"):
             self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(distance_m)))
             self._navigator.trust_gps(not is_wrong or not have_agreed)
             self._navigator.distrust_map(is_wrong and not have_agreed)
 
     def correct_height(self, ratio: float, ratio_sd: float) -> None:
         """Set the ratio of visual height to the autopilot's height above ground (1.0: equal), and its error."""
-        with self._link.turn("height"):
+        with self._link.take_turn("height"):
             self._navigator.correct_height(ratio, ratio_sd)
 
     def reset_navigation(self) -> None:
         """Restart the navigation, because later fixes have different errors."""
-        with self._link.turn("anew"):
+        with self._link.take_turn("anew"):
             self._navigator.reset_navigation()
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Send health, load and temperature (None: unknown) of this computer, and request another source set if needed.
         Call it once a second."""
-        with self._link.turn("report"):
+        with self._link.take_turn("report"):
             self._link.set_health(health)
             self._request_source_set()
             self._report_output()

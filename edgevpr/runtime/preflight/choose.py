@@ -146,7 +146,7 @@ def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, dema
 
 
 def find_accuracy(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
-    """Return the accuracy of `label` (technique and form, see `techniques.labelled`); None if it was not measured.
+    """Return the accuracy of `label` (technique and form, see `techniques.format_name`); None if it was not measured.
 
     `camera`: "nadir" or "forward" (None: forward). `candidates`: number of places compared with a query, if fewer than
     the technique's default (None: the default).

@@ -66,7 +66,7 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchSettings:
-    """Settings of the recogniser. `candidates` places are compared (None: all, fully; see `places.retrieve.compare`).
+    """Settings of the recogniser. `candidates` places are compared (None: all, fully; see `compare_places`).
     `verify` enables the landmark check. With `all_evidence`, landmarks are compared even where they decide nothing, to
     fit a model. The accuracy of a position is never below `min_accuracy_m` (1 sigma)."""
 
