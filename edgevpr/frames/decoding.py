@@ -69,8 +69,7 @@ def open_decoder(
 ) -> "VideoDecoder":
     """Open the stream or file `uri` with FFmpeg's `options`. `timeouts_s`: time limits in seconds for opening it and
     for each read (None: no limits). `format_name`: name of its format (None: FFmpeg detects it). `file`: an open file
-    to read instead, which the decoder closes. Raises OpeningError with the cause if it cannot be opened or has no
-    video."""
+    to read instead, which the decoder closes. Raises OpeningError with the cause on failure or without video."""
     with av.logging.Capture() as logged:
         try:
             container = av.open(file or uri, "r", format=format_name, options=options, timeout=timeouts_s)

@@ -1,11 +1,11 @@
-"""Checks the pictures of a flight before a map is made from them: which way the camera points, whether an on-screen
-display covers part of the pictures, and what the map will lack.
+"""Checks the pictures of a flight before a map is made from them: where the camera points, whether an on-screen display
+covers part of the pictures, and what the map will lack.
 
 From one picture of a forward camera to the next, the scene grows, but neither rotates nor moves up or down. With a
 camera that looks straight down, it moves in any direction and rotates. Landmarks of a few neighbouring pairs show this.
 
-The edges of moving ground have random directions, so they cancel in the mean of many pictures. Those of a display, or
-of the aircraft itself, remain.
+The edges of moving ground have random directions, so they cancel out in the mean of many pictures. Those of a display,
+or of the aircraft itself, remain.
 """
 
 import logging
@@ -38,32 +38,32 @@ _log = logging.getLogger(__name__)
 _RUN_COUNT = 6  # runs of neighbouring pictures to compare, spread over the folder
 _RUN_LENGTH = 3
 _TILT_RUN_LENGTH = 12  # frames of a video are so close together that only every third or fourth shows motion
-_VIDEO_PICTURES = 10  # of a video, a second apart
+_VIDEO_PICTURES = 10  # taken from a video, a second apart
 _TILT_VIDEO_PICTURES = 60
 _MAX_LANDMARKS = 500
 # Chosen on corridor and grief_stromovka_seasons (forward: at most 12 degrees and 0.07 of vertical motion), and on
 # aerial_caliterra and aerial_garfield28. Yaw moves the scene sideways too, so nearly all pairs must show such motion.
 _MIN_ROTATION_DEG = 15.0
-_MIN_UP_SHARE = 0.1
-_MIN_SIDEWAYS_SHARE = 0.3
+_MIN_UP_SHIFT = 0.1
+_MIN_SIDEWAYS_SHIFT = 0.3
 _MAX_SIDEWAYS_GROWTH = 0.03
 _MIN_CLEAR_PAIRS = 3  # pairs with rotation or vertical motion
-_MIN_CLEAR_SHARE = 0.2  # and their share of all pairs that show the same ground
+_MIN_CLEAR_FRACTION = 0.2  # and their fraction of all pairs that show the same ground
 _MIN_PAIRS = 6  # the same, including pairs with sideways motion
-_MIN_SHARE = 0.75
+_MIN_FRACTION = 0.75
 _MAX_DOWN_DEG = 25.0  # tilt of a gimbal from straight down
 _MIN_FORWARD_DEG = 45.0
 _MAX_USEFUL_HZ = 4.0  # places per second of a video; more of them look nearly the same
 _DISPLAY_SHAPE = 240, 320  # rows and columns of the reduced pictures in which a display is detected
 _DISPLAY_PICTURES = 24  # spread over the whole flight
-_MIN_DISPLAY_PICTURES = 12  # fewer are not conclusive
+_MIN_DISPLAY_PICTURES = 12  # fewer pictures are not conclusive
 _MIN_EDGE = 5.0  # grey levels per pixel; weaker edges are noise
-_MIN_KEPT_SHARE = 0.9  # of the strength of an edge that remains in the mean, if the edge is static
-# Share of pixels on static edges. A display has 0.03 to 0.04; two numbers and a cross alone have 0.006 to 0.009. Aerial
-# sets have at most 0.0003, and nordland_tiny, with its rails, 0.005. In corridor, whose walls run along the picture's
-# edges, it is 0.09.
-_MIN_DISPLAY_SHARE = 0.006
-_MAX_STATIC_EDGES = 0.5  # share of all edges; beyond, the camera itself did not move
+_MIN_STATIC_FRACTION = 0.9  # of an edge's strength that remains in the mean, if the edge is static
+# Fraction of pixels on static edges. A display has 0.03 to 0.04; two numbers and a cross alone have 0.006 to 0.009.
+# Aerial sets have at most 0.0003, and nordland_tiny, with its rails, 0.005. In corridor, whose walls run along the
+# picture's edges, it is 0.09.
+_MIN_DISPLAY_FRACTION = 0.006
+_MAX_STATIC_EDGES = 0.5  # fraction of all edges; if more are static, the camera itself did not move
 
 
 def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> None:
@@ -79,7 +79,7 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
         with closing(_open_video(uri)) as video:
             duration_s = video.total
         if total > _MAX_USEFUL_HZ * duration_s:
-            text = "every frame of %s becomes a place, %d in %d s: give --rate-hz 1 to make only %d"
+            text = "every frame of %s becomes a place (%d in %d s): pass --rate-hz 1 to make only %d"
             _log.warning(text, uri, total, duration_s, duration_s)
     if not has_position:
         _log.warning(
@@ -88,7 +88,7 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
             uri,
         )
     if total and places is not None and total + places < MIN_PLACES:
-        text = "at most %d places: a map of fewer than %d cannot be calibrated and finds little: give more pictures"
+        text = "at most %d places: a map of fewer than %d cannot be calibrated and recognises little; add pictures"
         _log.warning(text, total + places, MIN_PLACES)
 
 
@@ -101,14 +101,14 @@ def suggest_lens(pictures: FlightPictures, config: SourceConfig, technique: Tech
         and pictures.folder
         and (fov_deg := read_fov_deg(next(iter(list_images(pictures.folder))))) is not None
     ):
-        text = "EXIF: field of view about %.0f deg: give --fov-deg %.0f, here and in flight, for better positions"
+        text = "EXIF: field of view about %.0f deg: pass --fov-deg %.0f, here and in flight, for better positions"
         _log.info(text, fov_deg, fov_deg)
 
 
-@show_elapsed("checking which way the camera points")
+@show_elapsed("checking where the camera points")
 def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -> None:
-    """Log that the camera is assumed to look ahead, and why. Raises UsageError if the pictures clearly look straight
-    down; the user must then say which is meant."""
+    """Log that the camera is assumed to face forward, and why. Raises UsageError if it clearly looks straight down; the
+    user must then choose."""
     tilt_deg = _read_gimbal_tilt_deg(pictures.folder) if pictures.folder else None
     if tilt_deg is not None and not _MAX_DOWN_DEG < tilt_deg < _MIN_FORWARD_DEG:
         is_down, why = tilt_deg <= _MAX_DOWN_DEG, f"XMP data: tilted {tilt_deg:.0f} degrees from straight down"
@@ -116,15 +116,15 @@ def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -
         is_down, why = _compare_neighbours(pictures, mask)
     if is_down:
         raise UsageError(
-            f"These pictures look straight down ({why}): give --camera nadir, or --camera forward if they look ahead."
+            f"The camera looks straight down ({why}): pass --camera nadir, or --camera forward if it faces forward."
         )
-    _log.info("assuming that the camera looks ahead (%s): give --camera nadir if it looks straight down", why)
+    _log.info("assuming that the camera faces forward (%s): pass --camera nadir if it looks straight down", why)
 
 
 @show_elapsed("measuring the tilt of the camera")
 def require_level_camera(pictures: FlightPictures, fov_deg: float | None) -> None:
-    """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted, and its
-    angles are not recorded, so that the pictures cannot be levelled."""
+    """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted and its
+    angles are not recorded, because the pictures then cannot be levelled."""
     if pictures.folder:
         paths = [path for run in _choose_runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
         table = pictures.positions or find_positions(pictures.source)
@@ -141,15 +141,15 @@ def require_level_camera(pictures: FlightPictures, fov_deg: float | None) -> Non
         raise UsageError(
             f"The camera is tilted by {tilt.deg:.0f} degrees or more from straight down (measured from {tilt.pairs} "
             "pairs of neighbouring images), and its angles are not recorded, so every position would be far off. Add "
-            "roll_deg and pitch_deg to the table of positions and give --fov-deg, or give --camera forward."
+            "roll_deg and pitch_deg to the position table and pass --fov-deg, or pass --camera forward."
         )
 
 
 def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> tuple[bool, str]:
-    """Compare neighbouring pictures. Returns whether they clearly look down, and the reason as text."""
+    """Compare neighbouring pictures. Returns True if they clearly look down, and the reason as text."""
     folder = pictures.folder
     runs = map(_read_usable, _choose_runs(folder)) if folder else [_read_video(pictures.source, _VIDEO_PICTURES)]
-    pairs, clear, sideways = 0, 0, 0
+    pairs, clear_count, sideways_count = 0, 0, 0
     for run in runs:
         landmarks = [detect_landmarks(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
         for match in (measure_agreement(first, second) for first, second in pairwise(landmarks)):
@@ -161,13 +161,13 @@ def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> t
             ):
                 continue
             pairs += 1
-            if abs(wrap_deg(match.rotation_deg)) >= _MIN_ROTATION_DEG or abs(match.shift_share[1]) >= _MIN_UP_SHARE:
-                clear += 1
-            elif abs(match.shift_share[0]) >= _MIN_SIDEWAYS_SHARE and abs(match.scale - 1) <= _MAX_SIDEWAYS_GROWTH:
-                sideways += 1
-    is_clear = clear >= max(_MIN_CLEAR_PAIRS, _MIN_CLEAR_SHARE * pairs)
-    is_down = is_clear or clear + sideways >= max(_MIN_PAIRS, _MIN_SHARE * pairs)
-    return is_down, f"of {pairs} pairs of neighbours, {clear} rotate or move up or down, and {sideways} move sideways"
+            if abs(wrap_deg(match.rotation_deg)) >= _MIN_ROTATION_DEG or abs(match.shift_share[1]) >= _MIN_UP_SHIFT:
+                clear_count += 1
+            elif abs(match.shift_share[0]) >= _MIN_SIDEWAYS_SHIFT and abs(match.scale - 1) <= _MAX_SIDEWAYS_GROWTH:
+                sideways_count += 1
+    is_clear = clear_count >= max(_MIN_CLEAR_PAIRS, _MIN_CLEAR_FRACTION * pairs)
+    is_down = is_clear or clear_count + sideways_count >= max(_MIN_PAIRS, _MIN_FRACTION * pairs)
+    return is_down, f"of {pairs} image pairs, {clear_count} rotate or move vertically, {sideways_count} move sideways"
 
 
 @show_elapsed("checking for an on-screen display")
@@ -179,28 +179,28 @@ def warn_of_display(pictures: FlightPictures, mask: OverlayMask | None) -> None:
         images = _read_usable(paths[index] for index in indices)
     else:
         images = _read_video(pictures.source, _DISPLAY_PICTURES)
-    share = measure_static_share(images, mask)
-    if share is not None and share >= _MIN_DISPLAY_SHARE:
+    fraction = measure_static_fraction(images, mask)
+    if fraction is not None and fraction >= _MIN_DISPLAY_FRACTION:
         text = (
             "%.1f %% of the picture never changes: probably a display or a part of the aircraft. It would make places "
-            "look alike, so that they are confused or none is accepted. Mask it with --mask PNG, here and in flight"
+            "look alike, so that they are confused or all rejected. Mask it with --mask PNG, here and in flight"
         )
-        _log.warning(text, 100 * share)
+        _log.warning(text, 100 * fraction)
 
 
-def measure_static_share(images: Iterable[Image], mask: OverlayMask | None) -> float | None:
-    """Return the share (0..1) of the pixels of `images` that lie on a static edge, where `mask` shows ground (None:
+def measure_static_fraction(images: Iterable[Image], mask: OverlayMask | None) -> float | None:
+    """Return the fraction (0..1) of the pixels of `images` that are on a static edge, where `mask` shows ground (None:
     everywhere). None if there are too few images, or if the camera itself did not move."""
     count, allowed = 0, np.ones(_DISPLAY_SHAPE, bool)
     x, y, strength = np.zeros((3, *_DISPLAY_SHAPE), np.float32)
     for image in images:
-        across, along = _compute_gradients(image)
-        x, y, strength, count = x + across, y + along, strength + cv2.magnitude(across, along), count + 1
+        dx, dy = _compute_gradients(image)
+        x, y, strength, count = x + dx, y + dy, strength + cv2.magnitude(dx, dy), count + 1
         allowed &= _shrink_mask(mask.fit_to(image)) if mask else True
     if count < _MIN_DISPLAY_PICTURES:
         return None
     edges = allowed & (strength >= _MIN_EDGE * count)
-    static = edges & (cv2.magnitude(x, y) >= _MIN_KEPT_SHARE * strength)
+    static = edges & (cv2.magnitude(x, y) >= _MIN_STATIC_FRACTION * strength)
     return None if static.sum() > _MAX_STATIC_EDGES * edges.sum() else float(static.mean())
 
 
@@ -208,8 +208,8 @@ def _compute_gradients(image: Image) -> tuple[Singles, Singles]:
     """Return the brightness gradients of a reduced copy of a picture, to the right and down: float32 (H, W) each."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     grey = cv2.resize(grey.astype(np.float32), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_AREA)
-    across, along = (cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
-    return np.asarray(across, np.float32), np.asarray(along, np.float32)
+    dx, dy = (cv2.Sobel(grey, cv2.CV_32F, x_order, 1 - x_order, scale=1 / 8) for x_order in (1, 0))
+    return np.asarray(dx, np.float32), np.asarray(dy, np.float32)
 
 
 def _shrink_mask(allowed: Bools) -> Bools:

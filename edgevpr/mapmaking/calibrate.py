@@ -7,10 +7,10 @@ in three ways:
 * THERE: its place is in the map.
 * LEFT_OUT: its place and all that may show the same ground are removed. The best match is a similar-looking place.
 * MIRRORED: the query is its mirror image, which shows ground that exists nowhere but resembles the terrain of the map.
-  It only counts in the figures reported for the map.
-The results show how similar the places of this map look. The fit therefore adjusts the part of the shipped model that
-says which place it is (`Model.of_place`), and only as far as the results demand. The part that says whether the query
-shows mapped ground stays as shipped: pictures of other ground agree by chance to much the same degree in every map.
+  It is used only for the figures reported for the map.
+The results show how similar the places of this map look. So the fit adjusts the part of the *shipped* (default) model
+that decides which place it is (`Model.of_place`), and only as far as the results demand. The part that decides whether
+the query shows mapped ground is not changed: pictures of other ground agree by chance about equally in every map.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -48,29 +48,29 @@ from edgevpr.runtime.recognise.evidence import (
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule, make_accept_rule
 
-Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames with these names that can be found
+Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the available frames with these names
 
 THERE = "there"
 LEFT_OUT = "left out"
 MIRRORED = "mirrored"
 FORWARD_QUERIES = 120
-NADIR_QUERIES = 60  # fewer, because each takes longer
-_MAX_WITHOUT_POSITION = 0.2  # share of places; in nadir maps the order of pictures does not show which ones overlap
-_LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
-# Prior precisions of the weights and of the bias around the shipped model (see `fit_logistic`). Chosen on corridor and
-# sat_marash, while watching the other sets. With a nadir camera, a precision of 5 and a free bias, the random draw of
+NADIR_QUERIES = 60  # fewer, because each query takes longer
+_MAX_WITHOUT_POSITION = 0.2  # fraction of places; in nadir maps the order of pictures does not reveal overlaps
+_LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results, because flights outside the map are rarer
+# Prior precisions of weights and bias around the default model (see `fit_logistic`). Chosen on corridor and
+# sat_marash, while monitoring the other sets. With a nadir camera, a precision of 5 and a free bias, the random draw of
 # pictures decided whether 14 or 39 of 80 queries of sat_marash were accepted. With a forward camera, a prior on the
 # bias halves the number of queries accepted on corridor.
 _PRIOR_PRECISIONS = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
 _SEED = 15
-_LOW_PRECISION = 0.5  # required precision at which low confidence refuses hardly any match
+_LOW_PRECISION = 0.5  # required precision at which hardly any match is rejected for low confidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryResult:
     """Result of one query made from a picture of the map. `place_id`: the place of this picture. `way`: how the query
-    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the correct place. `evidence`: the evidence of the
-    best match (None: the picture has too little texture to search for). `refused`: the match was refused for a reason
+    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the correct place. `evidence`: the evidence for the
+    best match (None: the picture has too little texture to search for). `refused`: the match was rejected for a reason
     other than low confidence."""
 
     place_id: int
@@ -90,8 +90,8 @@ def query_map(
     seed: int = 0,
 ) -> Iterator[QueryResult]:
     """Query the map with altered pictures of its own places, in all three ways, and yield the results. `index` holds
-    the places of `place_map`; `rule` decides whether a match is accepted. `pictures` are pairs of a place's number and
-    its picture as encoded for the map. Places that are not in the index are skipped."""
+    the places of `place_map`; `rule` decides whether a match is accepted. `pictures` are pairs of a place id and its
+    picture as encoded for the map. Places that are not in the index are skipped."""
     rng = np.random.default_rng((_SEED, seed))
     assert rule.confidence_rule is not None  # set for techniques with a confidence model
     low_precision_rule = replace(rule.confidence_rule, precision=_LOW_PRECISION)
@@ -130,16 +130,16 @@ def calibrate(
     pictures: Pictures,
     progress: Progress,
 ) -> MapCalibration:
-    """Calibrate a map that is open for adding, and store the result in it. `pictures` reads the pictures with given
-    names; `progress` wraps the iteration over these frames to report progress. `encoder` is the one that the map was
-    made with.
+    """Calibrate a map that is open for writing, and store the result in it. `pictures` reads the pictures with the
+    given names; `progress` wraps the iteration over these frames to report progress. `encoder`: the one that made the
+    map.
     Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their pictures
     are found. Raises MapError if the map file cannot be read or written.
     """
 
     def require(condition: object, problem: str) -> None:
         if not condition:
-            raise UsageError(f"{place_map.path} cannot be calibrated and uses the shipped confidence: {problem}.")
+            raise UsageError(f"{place_map.path} cannot be calibrated and uses the default confidence model: {problem}.")
 
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)
@@ -160,14 +160,14 @@ def calibrate(
     queries = (
         (place_id, frame.picture) for place_id, frame in _encode_pictures(encoder, place_map, pictures, progress, count)
     )
-    answers = list(query_map(technique, place_map, index, rule, meter, queries))
-    place_count = len({answer.place_id for answer in answers})
+    results = list(query_map(technique, place_map, index, rule, meter, queries))
+    place_count = len({result.place_id for result in results})
     require(
         place_count >= MIN_PLACES,
-        f"pictures of only {place_count} places were found, but {MIN_PLACES} are needed; give the pictures that it was "
+        f"pictures of only {place_count} places were found, but {MIN_PLACES} are needed; pass the pictures that it was "
         "made from, with the same camera and mask",
     )
-    calibration = replace(_fit_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
+    calibration = replace(_fit_calibration(results, kinds, config.accept_precision), look_alikes=rule.look_alikes)
     place_map.record_calibration(format_calibration(calibration))
     return calibration
 
@@ -180,8 +180,8 @@ def count_queries(technique: Technique) -> int:
 def _encode_pictures(
     encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, progress: Progress, count: int
 ) -> Iterator[tuple[int, EncodedFrame]]:
-    """Yield (a place's number, its picture as encoded for the map) for `count` pictures in random order, starting over
-    if there are fewer. A picture whose name matches that of a place, but whose content differs, is skipped."""
+    """Yield (place id, its picture as encoded for the map) for `count` pictures in random order, starting over if there
+    are fewer. A picture whose name matches that of a place, but whose content differs, is skipped."""
     ids_by_image = {name: ids for (name,), ids in place_map.select_ids("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[index] for index in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
@@ -194,45 +194,43 @@ def _encode_pictures(
                 break
 
 
-def _fit_calibration(answers: Sequence[QueryResult], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Fit the models of all `kinds` of evidence to the answers, and count the answers accepted at the required
-    `precision`."""
-    usable = [answer for answer in answers if answer.evidence]
+def _fit_calibration(results: Sequence[QueryResult], kinds: Sequence[str], precision: float) -> MapCalibration:
+    """Fit the models of all `kinds` of evidence to the results, and count the matches accepted at this `precision`."""
+    usable = [result for result in results if result.evidence]
     made_of = f"{len(usable)} answers of the map itself"
     models = {kind: adapt_model(read_default_model(kind), kind, usable, made_of) for kind in kinds}
     rule = ConfidenceRule(models, precision)
     accepted = [
-        answer
-        for answer in answers
-        if (seen := answer.evidence) and not answer.refused and rule.confidence(seen) >= rule.threshold(seen)
+        result
+        for result in results
+        if (data := result.evidence) and not result.refused and rule.confidence(data) >= rule.threshold(data)
     ]
-    in_map = [answer for answer in answers if answer.way == THERE]
-    confidences: dict[int, list[float]] = {}  # of the queries of each place; 0 for a wrong or refused match
-    for answer in in_map:
-        seen = answer.evidence if answer.right and not answer.refused else None
-        confidences.setdefault(answer.place_id, []).append(rule.confidence(seen) if seen else 0.0)
+    in_map = [result for result in results if result.way == THERE]
+    confidences: dict[int, list[float]] = {}  # of the queries of each place; 0 for a wrong or rejected match
+    for result in in_map:
+        evidence = result.evidence if result.right and not result.refused else None
+        confidences.setdefault(result.place_id, []).append(rule.confidence(evidence) if evidence else 0.0)
     return MapCalibration(
         models=models,
         made=date.today().isoformat(),
         asked=len(in_map),
         precision=precision,
-        accepted=sum(answer.way == THERE for answer in accepted) / len(in_map),
-        accepted_wrong=sum(not answer.right for answer in accepted),
+        accepted=sum(result.way == THERE for result in accepted) / len(in_map),
+        accepted_wrong=sum(not result.right for result in accepted),
         recognisable={place_id: round(float(np.mean(values)), 4) for place_id, values in sorted(confidences.items())},
     )
 
 
-def adapt_model(model: Model, kind: str, answers: Iterable[QueryResult], made_of: str) -> Model:
+def adapt_model(model: Model, kind: str, results: Iterable[QueryResult], made_of: str) -> Model:
     """Return a copy of `model`, the confidence model for this kind of evidence, with its `of_place` fitted to the
-    answers of a map. Answers without evidence are ignored. `made_of`: a note on the data that it was fitted to, stored
-    in the model."""
-    usable = [(answer, answer.evidence) for answer in answers if answer.evidence and answer.way != MIRRORED]
+    results of a map. Results without evidence are ignored. `made_of`: note on the data, stored in the model."""
+    usable = [(result, result.evidence) for result in results if result.evidence and result.way != MIRRORED]
     # If the landmarks of the best place were not compared, no landmarks agree.
     rows = [{"landmarks": 0.0} | evidence.figures() for _, evidence in usable]
-    right = np.array([answer.right for answer, _ in usable], bool)
+    right = np.array([result.right for result, _ in usable], bool)
     of_place = model.of_place
-    if not right.all():  # a fit needs wrong answers too
-        weights = np.array([_LEFT_OUT_WEIGHT if answer.way == LEFT_OUT else 1.0 for answer, _ in usable])
+    if not right.all():  # a fit needs wrong matches too
+        weights = np.array([_LEFT_OUT_WEIGHT if result.way == LEFT_OUT else 1.0 for result, _ in usable])
         of_place = fit_logistic(of_place, rows, right, weights, *_PRIOR_PRECISIONS[kind])
     return Model(
         of_map=model.of_map,
@@ -256,7 +254,7 @@ def fit_logistic(
     float (N,), are the weights of the rows.
 
     Gaussian priors keep the regression near `start`: variance 1 / `precision` for its scaled coefficients, and
-    1 / `bias_precision` for its bias (0: the bias is free). With few rows the result stays close to `start`.
+    1 / `bias_precision` for its bias (0: the bias is free). With few rows, the result stays close to `start`.
     """
     scales, features = np.array(start.scales), make_evidence_matrix(rows, start.names) / np.array(start.scales)
     prior_mean = np.append(np.array(start.weights) * scales, start.bias)
@@ -270,8 +268,8 @@ def fit_logistic(
         slope = -weights * sign * np.exp(-np.logaddexp(0, sign * logit))
         return float(loss), np.append(features.T @ slope, slope.sum()) + precisions * offset
 
-    fitted = minimize(cost, prior_mean, jac=True, method="L-BFGS-B").x
-    return Logistic(start.names, tuple((fitted[:-1] / scales).tolist()), start.scales, float(fitted[-1]))
+    solution = minimize(cost, prior_mean, jac=True, method="L-BFGS-B").x
+    return Logistic(start.names, tuple((solution[:-1] / scales).tolist()), start.scales, float(solution[-1]))
 
 
 def make_evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:

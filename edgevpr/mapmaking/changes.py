@@ -1,8 +1,8 @@
 """Alters pictures as if taken on another day, in another season, from another height and on another course. `calibrate`
 makes its queries from the map's own pictures this way.
 
-No single change is realistic. Together they reduce the share of agreeing regions as much as real changes do, so that
-right and wrong matches are as hard to tell apart as in flight. `strength` is about 0 (hardly any change) to 1.3.
+No single change is realistic. Together they reduce the fraction of agreeing regions as much as real changes do, so that
+correct and wrong matches are as hard to distinguish as in flight. `strength`: from about 0 (hardly any change) to 1.3.
 """
 
 import cv2
@@ -11,21 +11,20 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
 from edgevpr.frames.images import resize
 
-_STRENGTH_RANGE = (0.3, 1.3)  # from a change like a cloud to one like snow
-# Size of the pictures in the sets that the strengths were chosen on. Larger pictures take long to alter, and their
+_STRENGTH_RANGE = (0.3, 1.3)  # from a slight change, such as a cloud, to a strong one, such as snow
+# Size of the pictures in the sets on which the strengths were chosen. Larger pictures take long to alter, and their
 # noise, which is per pixel, would be averaged away.
 _MAX_PX = 640
 _TONE_POINTS = 6  # points of a tone curve
-_MAX_PATCHES = 2  # plain patches that hide part of the picture
+_MAX_PATCHES = 2  # uniform patches that hide part of the picture
 
 
 def change_picture(
     image: Image, rng: np.random.Generator, looks_down: bool, mask: Mask | None = None
 ) -> tuple[Image, Mask | None]:
     """Alter a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
-    by any angle. `mask`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere). Returns
-    * the altered picture, uint8 grey, at most 640 pixels long, and
-    * the mask of the altered picture."""
+    by a random angle. `mask`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere).
+    Returns the altered picture, uint8 grey, at most 640 pixels long, and its mask."""
     strength = rng.uniform(*_STRENGTH_RANGE)
     if (shrink := _MAX_PX / max(image.shape[:2])) < 1:
         size_px = round(shrink * image.shape[1]), round(shrink * image.shape[0])
@@ -44,8 +43,8 @@ def change_picture(
 
 
 def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
-    """Return a random pixel homography, (3, 3), that alters a picture of this `shape` like another position, height,
-    course and tilt of the camera."""
+    """Return a random pixel homography, (3, 3), that alters a picture of this `shape` like a different position,
+    height, course and tilt of the camera."""
     height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
     turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength
@@ -53,8 +52,8 @@ def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength
     matrix[0, 2] += rng.uniform(-0.15, 0.15) * width * strength
     matrix[1, 2] += rng.uniform(-0.15, 0.15) * height * strength * (1.0 if looks_down else 0.4)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
-    moved = corners + (rng.uniform(-0.05, 0.05, (4, 2)) * (width, height) * strength).astype(np.float32)
-    warp: Doubles = cv2.getPerspectiveTransform(corners, moved) @ np.vstack([matrix, (0, 0, 1)])
+    moved_corners = corners + (rng.uniform(-0.05, 0.05, (4, 2)) * (width, height) * strength).astype(np.float32)
+    warp: Doubles = cv2.getPerspectiveTransform(corners, moved_corners) @ np.vstack([matrix, (0, 0, 1)])
     return warp
 
 
@@ -75,7 +74,7 @@ def change_season(grey: Singles, rng: np.random.Generator, strength: float) -> S
 
 
 def _change_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:
-    """Add soft shadows, another exposure, blur (in half of the pictures) and sensor noise to `grey`, float (H, W)."""
+    """Add soft shadows, a different exposure, blur (to half of the pictures) and noise to `grey`, float (H, W)."""
     lit: Floats = np.clip(grey * np.exp(0.5 * strength * _make_smooth_field(rng, grey.shape, 3)), 0, 1)
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
@@ -85,7 +84,7 @@ def _change_light(grey: Singles, rng: np.random.Generator, strength: float) -> F
 
 
 def _cover_patches(grey: Floats, rng: np.random.Generator, strength: float) -> None:
-    """Cover `grey`, float (H, W), in place with up to two plain patches."""
+    """Cover `grey`, float (H, W), in place with up to two uniform patches."""
     height, width = grey.shape
     for _ in range(rng.integers(0, _MAX_PATCHES + 1)):
         x, y, half = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.05, 0.2) * width * strength
@@ -95,12 +94,12 @@ def _cover_patches(grey: Floats, rng: np.random.Generator, strength: float) -> N
 
 def _make_tone_curve(rng: np.random.Generator, strength: float) -> Singles:
     points = np.linspace(0, 1, _TONE_POINTS)
-    bent = np.clip(points + 0.45 * strength * rng.normal(size=_TONE_POINTS), 0, 1)
-    return np.interp(np.linspace(0, 1, 256), points, bent).astype(np.float32)
+    levels = np.clip(points + 0.45 * strength * rng.normal(size=_TONE_POINTS), 0, 1)
+    return np.interp(np.linspace(0, 1, 256), points, levels).astype(np.float32)
 
 
 def _make_smooth_field(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> Singles:
-    """Return a random smooth field, float32 of this shape, with values about -1..1; more `cells` vary faster."""
+    """Return a random smooth field, float32 of this shape, of values about -1..1; more `cells` vary faster."""
     coarse = rng.normal(size=(cells, cells)).astype(np.float32)
     field = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray(field / max(float(np.abs(field).max()), 1e-6), np.float32)

@@ -1,5 +1,5 @@
-"""Finishes a map once its places are made: refines their positions and calibrates its confidence. The commands
-`edgevpr map refine` and `map calibrate` each do one of these to an existing map."""
+"""Finishes a map after its places have been made: refines their positions and calibrates its confidence. The commands
+`edgevpr map refine` and `map calibrate` each do one of these steps for an existing map."""
 
 import logging
 from collections.abc import Collection, Iterator
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FinishedMap:
-    """Result of `finish_map`. `refined`, `calibration`: results of refining and calibrating (None: not done).
+    """Result of `finish_map`. `refined`, `calibration`: results of the two steps (None: not done).
     `not_done`: a sentence for each requested step that failed, with the reason."""
 
     refined: "Refinement | None"
@@ -51,18 +51,18 @@ def finish_map(
     calibrate: bool = True,
 ) -> FinishedMap:
     """Refine and calibrate an open map, as far as its technique allows. `pictures` None: not available, so the map is
-    not calibrated. The result lists what failed and nothing is raised, because a map is usable without these steps."""
+    not calibrated. Failures are listed in the result and not raised, because a map is usable without these steps."""
     technique, refined, calibration, not_done = encoder.technique, None, None, []
     if refine and technique.spec.looks_down and not isinstance(pictures, OrthophotoGrid):
         try:
             refined = refine_map(place_map, technique, pictures.folder if pictures else None, progress)
         except EdgevprError as error:
-            not_done.append(f"the map is not refined: {error}")
+            not_done.append(f"the map was not refined: {error}")
     if calibrate and pictures and list_evidence_kinds(technique.spec):
         try:
             calibration = calibrate_map(place_map, encoder, match, pictures, progress)
         except EdgevprError as error:
-            not_done.append(f"the map is not calibrated: {error}")
+            not_done.append(f"the map was not calibrated: {error}")
     return FinishedMap(refined, calibration, tuple(not_done))
 
 
@@ -81,8 +81,8 @@ def refine_map(
     refined = refine(place_map, technique, progress, images)
     if refined.is_mirrored:
         _log.warning(
-            "lat and lon may be swapped, or one has lost its sign (south and west are negative): the pictures fit the "
-            "mirror image of their positions, so %s is not refined: check the columns, then rebuild the map",
+            "lat and lon may be swapped, or one has the wrong sign (south and west are negative): the pictures fit the "
+            "mirror image of their positions, so %s was not refined; check the columns, then rebuild the map",
             place_map.path,
         )
     return refined
@@ -119,7 +119,7 @@ def calibrate_map(
 def make_encoder(
     source: SourceConfig, pictures: FlightPictures | OrthophotoGrid | None, technique: Technique
 ) -> FrameEncoder:
-    """Return the encoder for places: with mask and levelling, which pictures cut from an orthophoto do not need."""
+    """Return the encoder for places, with mask and levelling unless the pictures are cut from an orthophoto."""
     if isinstance(pictures, OrthophotoGrid):
         return FrameEncoder(technique=technique)
     levelling = make_levelling(source, technique, below=True)

@@ -47,7 +47,7 @@ class GeoRaster:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a file. Raises SourceError if it is not a picture or has no georeference."""
+        """Open a file. Raises SourceError if it is not a picture or is not georeferenced."""
         self.name = str(path)
         try:
             with warnings.catch_warnings():
@@ -55,27 +55,27 @@ class GeoRaster:
                 self._data = rasterio.open(path)
         except (RasterioError, OSError) as error:
             raise SourceError(
-                f"{self.name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file."
+                f"{self.name} cannot be opened as an orthophoto: use a GeoTIFF, VRT or MBTiles file."
             ) from error
         self.crs, self.transform = self._data.crs, self._data.transform
         self.width, self.height = self._data.width, self._data.height
         self._bands = self._find_colour_bands()
 
     def _find_colour_bands(self) -> list[int]:
-        """Return the numbers (from 1) of the blue, green and red bands, or of the grey band. Raises SourceError."""
-        kinds, dtypes = self._data.colorinterp, self._data.dtypes
-        colours = [kinds.index(colour) + 1 for colour in _COLOURS if colour in kinds]
-        others = [number for number, kind in enumerate(kinds, start=1) if kind != ColorInterp.alpha]
+        """Return the band numbers (from 1) of blue, green and red, or of grey. Raises SourceError."""
+        interpretations, dtypes = self._data.colorinterp, self._data.dtypes
+        colours = [interpretations.index(colour) + 1 for colour in _COLOURS if colour in interpretations]
+        others = [number for number, kind in enumerate(interpretations, start=1) if kind != ColorInterp.alpha]
         if len(colours) < 3:
             colours = others[2::-1] if len(others) >= 3 else others[:1]
         fault = None
         if not self.crs or self.transform.is_identity:
             fault = "it has no georeference (coordinate system and position)"
-        elif ColorInterp.palette in kinds:
+        elif ColorInterp.palette in interpretations:
             fault = "its colours are palette indices (convert it with `gdal_translate -expand rgb`)"
         elif not colours or any(dtypes[band - 1] != "uint8" for band in colours):
             fault = (
-                f"it contains {dtypes[0]} values, such as heights, and not an 8-bit picture (convert a 16-bit picture "
+                f"it contains {dtypes[0]} values, such as heights, not an 8-bit picture (convert a 16-bit picture "
                 "with `gdal_translate -ot Byte -scale`)"
             )
         if fault:

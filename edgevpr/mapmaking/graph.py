@@ -3,7 +3,7 @@ recorded positions and the ties. A tie is the relative pose of two pictures that
 
 A place has two complex unknowns. Its position p is east + i north, in metres. Its *log* l is a complex logarithm of
 footprint and direction: exp(l) = footprint_m exp(-i up), a factor that converts an offset in the picture (right + i up,
-in shares of its longest side) to one on the ground. In a tie, `step` is the offset of the centre of picture `query`
+as fractions of its longest side) to one on the ground. In a tie, `step` is the offset of the centre of picture `query`
 from the centre of picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale from `place` to
 `query`:
 
@@ -12,7 +12,7 @@ from the centre of picture `place`, in picture `place`, and exp(`turn`) is the r
 Both are holomorphic, so complex least squares is exact and halves the number of unknowns. Steps are compared in the
 picture, not on the ground, because otherwise a map shrunk to a point would satisfy all ties. The recorded positions
 determine position, scale and direction of the whole map. Steps, turns and recorded positions are weighted by standard
-deviations that are estimated from the residuals; outliers get little weight (Geman and McClure 1987).
+deviations estimated from the residuals, and outliers are given little weight (Geman and McClure 1987).
 """
 
 from dataclasses import dataclass
@@ -29,10 +29,10 @@ from edgevpr.core.text import show_elapsed
 _MAX_ROUNDS = 4  # estimates of the standard deviations
 _MIN_SD_CHANGE = 0.05  # relative; a smaller change ends the rounds
 _MAX_STEPS = 40  # Gauss-Newton steps
-_MIN_MOVE = 1e-4  # as a share of a footprint; smaller moves end the steps
-_MAX_LOG_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
-# Ratio of actual to nominal standard deviations of ties: initial estimate, and lower limit, since a few ties that agree
-# well by chance must not make the others look wrong.
+_MIN_MOVE = 1e-4  # as a fraction of a footprint; smaller moves end the steps
+_MAX_LOG_MOVE = 0.5  # maximum change of a log in one Gauss-Newton step
+# Ratio of actual to nominal standard deviations of ties: initial estimate, and lower limit, because a few ties that
+# agree well by chance must not make the others look wrong.
 _INITIAL_TIE_FACTOR = 3.0
 _MIN_TIE_FACTOR = 0.5
 _MIN_RECORDED_SD_M = 0.5
@@ -44,7 +44,7 @@ _DIAGONAL_DAMPING = 1e-6  # added to the diagonal, so that places without ties c
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ties:
-    """T pairs of pictures of the same ground: `query` and `place`, int (T,), are the numbers of the two pictures.
+    """T pairs of pictures of the same ground: `query` and `place`, int (T,), are the indices of the two pictures.
     `step` and `turn`, complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are
     their standard deviations along one axis, up to a common factor that `solve_graph` estimates."""
 
@@ -64,7 +64,7 @@ class GraphSolution:
     """The solved graph of N places with T ties. `position`, complex (N,): east + i north in metres. `log`, complex
     (N,): footprint and direction, as in the module's docstring.
     `position_var` (m^2) and `log_var`, float (N,): variances of `position` and `log`, summed over both axes.
-    `component`, int (N,): number of each place's group; the places of a group are connected by ties.
+    `component`, int (N,): index of each place's group; the places of a group are connected by ties.
     `recorded_sd_m`: estimated standard deviation of recorded positions along one axis.
     `ties_agree`, bool (T,): False for ties that contradict the others."""
 
@@ -80,17 +80,17 @@ class GraphSolution:
 @show_elapsed("refining: solving for all positions")
 def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
-    north in metres; a common standard deviation is estimated for them."""
+    north in metres, for which a common standard deviation is estimated."""
     count = len(recorded)
     _, component = connected_components(_make_tie_matrix(ties, count), directed=False)
     graph = _Graph(recorded, ties, component)
     factor, recorded_sd_m = _INITIAL_TIE_FACTOR, _INITIAL_RECORDED_SD_M
     for _ in range(_MAX_ROUNDS):
-        before, sd_m = factor, recorded_sd_m
-        normal, agree = graph.optimise(sd_m, factor)
+        last_factor, sd_m = factor, recorded_sd_m
+        normal, weights = graph.optimise(sd_m, factor)
         variance = 2 * _invert_diagonal(normal)  # the weights are per axis, the variance is the sum of both axes
         if len(ties):
-            # The unknowns absorb part of the residuals: correct the estimate by the share of redundant observations.
+            # The unknowns absorb part of the residuals: correct the estimate by the fraction of redundant observations.
             redundancy = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
             median = float(np.median(graph.compute_tie_residuals()))
             factor = max(_MIN_TIE_FACTOR, median / _MEDIAN_LENGTH / np.sqrt(redundancy))
@@ -98,7 +98,7 @@ def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
         # Add the variance of the solution: with few ties, the solution follows every error of a recorded position.
         total_var_m2 = _estimate_sd(residual_m) ** 2 + np.median(variance[:count]) / 2
         recorded_sd_m = max(_MIN_RECORDED_SD_M, float(np.sqrt(total_var_m2)))
-        if abs(np.log(before / factor)) < _MIN_SD_CHANGE and abs(np.log(sd_m / recorded_sd_m)) < _MIN_SD_CHANGE:
+        if abs(np.log(last_factor / factor)) < _MIN_SD_CHANGE and abs(np.log(sd_m / recorded_sd_m)) < _MIN_SD_CHANGE:
             break
     return GraphSolution(
         position=graph.position,
@@ -107,7 +107,7 @@ def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
         log_var=variance[count:],
         component=component,
         recorded_sd_m=recorded_sd_m,
-        ties_agree=agree >= _MIN_AGREEMENT,
+        ties_agree=weights >= _MIN_AGREEMENT,
     )
 
 
@@ -122,16 +122,16 @@ class _Graph:
         count = len(recorded)
         position, log = np.zeros(count, complex), np.zeros(count, complex)
         tree = minimum_spanning_tree(_make_tie_matrix(ties, count))
-        tie_of = {}
+        tie_by_pair = {}
         for tie in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most accurate tie of a pair comes last
             query, place, step, turn = int(ties.query[tie]), int(ties.place[tie]), ties.step[tie], ties.turn[tie]
-            tie_of[query, place], tie_of[place, query] = (step, turn), (-step * np.exp(-turn), -turn)
-        for number in range(component.max(initial=-1) + 1):
-            members = np.flatnonzero(component == number)
+            tie_by_pair[query, place], tie_by_pair[place, query] = (step, turn), (-step * np.exp(-turn), -turn)
+        for group in range(component.max(initial=-1) + 1):
+            members = np.flatnonzero(component == group)
             order, predecessors = breadth_first_order(tree, members[0], directed=False)
             for place in order[1:].tolist():
                 base = int(predecessors[place])
-                step, turn = tie_of[place, base]
+                step, turn = tie_by_pair[place, base]
                 position[place], log[place] = position[base] + np.exp(log[base]) * step, log[base] + turn
             scale, offset = _fit_robust_similarity(position[members], recorded[members])
             position[members] = scale * position[members] + offset
@@ -144,18 +144,18 @@ class _Graph:
         tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
         for _ in range(_MAX_STEPS):
-            agree = _weigh_residuals(self.compute_tie_residuals() / factor)
-            step_weights, turn_weights = (agree / (factor * sd) ** 2 for sd in (ties.step_sd, ties.turn_sd))
+            weights = _weigh_residuals(self.compute_tie_residuals() / factor)
+            step_weights, turn_weights = (weights / (factor * sd) ** 2 for sd in (ties.step_sd, ties.turn_sd))
             recorded_weights = _weigh_residuals(abs(self.position - self._recorded) / sd_m) / sd_m**2
             jacobian, residuals = self._linearise(*map(np.sqrt, (step_weights, turn_weights, recorded_weights)))
             normal = (jacobian.conj().T @ jacobian).tocsc()
             move = _factorise(normal).solve(-(jacobian.conj().T @ residuals))
             # Shorten a long move, because the problem is not linear in the logs far from the solution.
-            share = min(1.0, _MAX_LOG_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
-            self.position, self.log = self.position + share * move[:count], self.log + share * move[count:]
+            damping = min(1.0, _MAX_LOG_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
+            self.position, self.log = self.position + damping * move[:count], self.log + damping * move[count:]
             if (abs(move[:count]) < _MIN_MOVE * np.exp(self.log.real)).all():
                 break
-        return normal, agree
+        return normal, weights
 
     def compute_tie_residuals(self) -> Floats:
         """Return the residual of each tie, in its standard deviations: float (T,)."""
@@ -199,14 +199,14 @@ def _make_tie_matrix(ties: Ties, count: int) -> csc_matrix:
 
 def _fit_robust_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
     """Return two complex numbers, `scale` (with rotation) and `offset`, such that scale * `shape` + offset fits
-    `recorded`; both are points, complex (N,). Outliers get little weight. For a single point the scale is 1."""
+    `recorded`; both are points, complex (N,). Outliers are given little weight. For a single point the scale is 1."""
     weight = np.ones(len(shape))
     scale, offset = 1 + 0j, complex(recorded.mean() - shape.mean())
     for _ in range(20):
-        fitted, shift = fit_similarity(shape, recorded, weight)
-        if abs(fitted) < 1e-6:
+        new_scale, new_offset = fit_similarity(shape, recorded, weight)
+        if abs(new_scale) < 1e-6:
             break
-        scale, offset = fitted, shift
+        scale, offset = new_scale, new_offset
         residuals = abs(scale * shape + offset - recorded)
         weight = _weigh_residuals(residuals / max(_MIN_RECORDED_SD_M, _estimate_sd(residuals))) + 1e-6
     return scale, offset
@@ -225,8 +225,8 @@ def _estimate_sd(residuals: np.ndarray) -> float:
 def _factorise(normal: csc_matrix) -> SuperLU:
     """Factorise a Hermitian positive definite matrix (M, M) as L D L^H, with its rows and columns reordered to keep L
     sparse. The factor `U` is D L^H."""
-    filled = normal + _DIAGONAL_DAMPING * identity(normal.shape[0])
-    return splu(filled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    damped = normal + _DIAGONAL_DAMPING * identity(normal.shape[0])
+    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def _invert_diagonal(normal: csc_matrix) -> Floats:
@@ -234,13 +234,13 @@ def _invert_diagonal(normal: csc_matrix) -> Floats:
 
     The inverse is computed only where L has entries, from the last column to the first (Takahashi, Fagan and Chen
     1973). A column needs the block of the inverse at its rows, which is part of the block of its parent: the column
-    with the number of its first row.
+    whose index is that of its first row.
     """
     factored = _factorise(normal)
     lower, pivots = factored.L.tocsc(), factored.U.diagonal().real
     lower.sort_indices()
     below = _find_rows_below(lower)
-    waiting = np.bincount([rows[0] for rows in below if len(rows)], minlength=len(below))  # children left per column
+    pending_children = np.bincount([rows[0] for rows in below if len(rows)], minlength=len(below))  # per column
     blocks: dict[int, Complexes] = {}
     diagonal = np.empty(len(below))
     for column in reversed(range(len(below))):
@@ -249,17 +249,17 @@ def _invert_diagonal(normal: csc_matrix) -> Floats:
         block[0, 0] = 1 / pivots[column]
         if len(rows):
             parent = int(rows[0])
-            inside = np.searchsorted(np.append(parent, below[parent]), rows)
-            block[1:, 1:] = blocks[parent][np.ix_(inside, inside)]
+            indices = np.searchsorted(np.append(parent, below[parent]), rows)
+            block[1:, 1:] = blocks[parent][np.ix_(indices, indices)]
             factors = np.zeros(len(rows), complex)
             factors[np.searchsorted(rows, lower.indices[stored])] = lower.data[stored]
             block[1:, 0] = -block[1:, 1:] @ factors
             block[0, 1:] = block[1:, 0].conj()
             block[0, 0] -= np.vdot(factors, block[1:, 0])
-            waiting[parent] -= 1
-            if not waiting[parent]:
+            pending_children[parent] -= 1
+            if not pending_children[parent]:
                 del blocks[parent]
-        if waiting[column]:
+        if pending_children[column]:
             blocks[column] = block
         diagonal[column] = block[0, 0].real
     original_order: Floats = diagonal[factored.perm_c]
@@ -267,8 +267,8 @@ def _invert_diagonal(normal: csc_matrix) -> Floats:
 
 
 def _find_rows_below(lower: csc_matrix) -> list[Array]:
-    """Return, for each column of the factor L (M, M), the numbers of the rows below the diagonal that may have entries:
-    M arrays, int (R,), ascending. Entries that are zero by chance, and therefore not stored, count."""
+    """Return, for each column of the factor L (M, M), the indices of the rows below the diagonal that may have entries:
+    M arrays, int (R,), ascending. They include entries that are zero by chance and therefore not stored."""
     starts, ends = lower.indptr[:-1] + 1, lower.indptr[1:]
     below = [lower.indices[start:end] for start, end in zip(starts, ends, strict=True)]
     for rows in below:

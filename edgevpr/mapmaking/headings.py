@@ -1,8 +1,8 @@
-"""Estimates headings that were not recorded, for a tilted camera, from the motion between images.
+"""Estimates unrecorded headings for a tilted camera from the motion between images.
 
 A tilted camera shows ground far from the aircraft, in its viewing direction, so a place needs the heading. Neighbouring
-images are levelled by the known tilt; the same ground then moves between them by a rotation and a shift. The heading is
-the course over ground between the two positions minus the direction of the shift.
+images are levelled with the known tilt; the same ground then moves between them by a rotation and a shift. The heading
+is the course over ground between the two positions minus the direction of the shift.
 """
 
 import math
@@ -19,21 +19,21 @@ from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, co
 from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
 
 _MIN_STEP_M = 3.0  # between two positions; over shorter steps, position errors dominate the course
-_MAX_DIFFERENCE_DEG = 20.0  # between the headings from the motion before and after an image; beyond, one is wrong
-_MAX_SCALE = 1.2  # scale change of the same ground between two images; beyond, tilt or height has changed
+_MAX_DIFFERENCE_DEG = 20.0  # between the headings from the motion before and after an image; if larger, one is wrong
+_MAX_SCALE = 1.2  # of the same ground between two images; if larger, tilt or height has changed
 
 
 def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
-    """Yield all frames. A frame that is tilted by 20 to 60 degrees and has no heading gets one, if the motion from the
-    previous frame or to the next frame shows it."""
+    """Yield all frames. A frame that is tilted by 20 to 60 degrees and has no heading is assigned one, if the motion
+    from the previous frame or to the next frame determines it."""
     orb = cv2.ORB.create(FEATURES)
     last: tuple[Frame, Features | None, float | None] | None = None
     for frame in frames:
         features = detect_features(orb, frame.image) if lacks_heading(frame, lens) else None
         heading_deg = turn_deg = None
         if last and last[1] and features:
-            measured = _measure_heading(last[0], last[1], frame, features, lens)
-            heading_deg, turn_deg = measured or (None, None)
+            heading_and_turn = _measure_heading(last[0], last[1], frame, features, lens)
+            heading_deg, turn_deg = heading_and_turn or (None, None)
         if last:
             before_deg = None if heading_deg is None or turn_deg is None else heading_deg - turn_deg
             yield _set_heading(last[0], last[2], before_deg)
@@ -60,26 +60,26 @@ def _measure_heading(
     pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _MIN_STEP_M else None
     if pairs is None:
         return None
-    old, new = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
-    turn_scale, shift = fit_similarity(old, new)
+    src, dst = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
+    turn_scale, shift = fit_similarity(src, dst)
     if not 1 / _MAX_SCALE < abs(turn_scale) < _MAX_SCALE:
         return None
-    # The ground moves opposite to the camera. In the picture x points right and y down, so backwards.
+    # The ground moves opposite to the camera. In the picture, x points right and y down, which is backwards.
     bearing_deg = math.degrees(math.atan2(-shift.real, shift.imag))
     course_deg = math.degrees(math.atan2(east_m, north_m))
     return course_deg - bearing_deg - lens.up_deg, -math.degrees(math.atan2(turn_scale.imag, turn_scale.real))
 
 
 def _project_to_ground(points: Doubles, frame: Frame, lens: Lens) -> Array:
-    """Return where image points (n, 2) lie on the ground: complex (n,), right + i back of the point below the camera,
-    in units of the camera's height."""
+    """Project image points (n, 2) to the ground. Returns complex (n,), right + i back of the point below the camera, in
+    units of the camera's height."""
     focal = 0.5 / math.tan(math.radians(lens.fov_deg) / 2)
     rays = compute_level_rotation(frame, lens) @ np.column_stack([points / focal, np.ones(len(points))]).T
     return np.asarray((rays[0] + 1j * rays[1]) / np.maximum(rays[2], 0.1))
 
 
 def _set_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
-    """Set a frame's heading to the mean of those from the motion before and after it (None: unknown) if they agree."""
+    """Set a frame's heading to the mean of those from the motion before and after it (None: unknown), if they agree."""
     headings_deg = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
     if not headings_deg or abs(wrap_deg(headings_deg[0] - headings_deg[-1])) > _MAX_DIFFERENCE_DEG:
         return frame

@@ -1,8 +1,8 @@
 """Finds places of a map that look alike.
 
-A map for a forward camera stores, for each place, which place elsewhere looks most like it (see `evidence.LookAlikes`);
-to find it, each picture of the map is compared with the places elsewhere. With a camera that looks down, landmarks tell
-similar places apart in flight, so only the page of a map lists them.
+A map for a forward camera stores, for each place, the place elsewhere that looks most like it (see
+`evidence.LookAlikes`); to find it, each picture of the map is compared with the places elsewhere. With a camera that
+looks down, landmarks distinguish similar places in flight, so look-alikes are only listed on the page of a map.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -41,9 +41,9 @@ from edgevpr.runtime.recognise.opening import create_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-_MAX_OVERLAP_SLOTS = 10  # this many places before and after one without a position may show the same ground
-_MAX_OVERLAP_FOOTPRINTS = 2.0  # between two places; beyond, pictures from any heights share no ground
-MIN_LOOK_ALIKE_CONFIDENCE = 0.1  # of the match with a place elsewhere, for the page of a map to list it
+_MAX_OVERLAP_SLOTS = 10  # without positions, this many places before and after one may show the same ground
+_MAX_OVERLAP_FOOTPRINTS = 2.0  # between two places; pictures further apart share no ground, whatever their heights
+MIN_LOOK_ALIKE_CONFIDENCE = 0.1  # of the match with a place elsewhere that is listed on the page of a map
 _DIGITS = 3  # decimals of stored agreements
 
 
@@ -61,13 +61,13 @@ class MapSearch:
         self.slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
 
     def find_same_ground(self, slot: int) -> Bools:
-        """Return bool (N,), True for each of the N places in the index that may share ground with the place `slot`."""
+        """Return bool (N,), True for each place in the index that may share ground with the place `slot`."""
         index = self._index
-        away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
+        distances_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
         slots_away = abs(np.arange(len(index)) - slot)
         follows_route = count_neighbours(self._rule.look_alikes) > 0
         is_adjacent = slots_away <= (_MAX_OVERLAP_SLOTS if follows_route else 0)
-        return np.where(np.isnan(away_m), is_adjacent, away_m <= _MAX_OVERLAP_FOOTPRINTS * self.near_m)
+        return np.where(np.isnan(distances_m), is_adjacent, distances_m <= _MAX_OVERLAP_FOOTPRINTS * self.near_m)
 
     def find(self, place_id: int, image: Image, mask: Mask | None, candidates: PlaceIndex) -> Recognition:
         """Search the places of `candidates` for a picture of the place `place_id`. `mask`, bool (H, W), is False where
@@ -87,8 +87,8 @@ def measure_look_alikes(
     pictures: Iterable[tuple[int, Descriptor]],
 ) -> LookAlikes:
     """Compare the pictures of a map for a forward camera with its places: the neighbours in mapping order, and those
-    elsewhere that a search finds. `pictures`: pairs of a place's number and the descriptor of its picture.
-    `near_m`: as in `outside_neighbourhood`. Raises MapError if the map cannot be read."""
+    elsewhere that a search finds. `pictures`: pairs of a place id and the descriptor of its picture. `near_m`: as
+    `neighbour_m` in `outside_neighbourhood`. Raises MapError if the map cannot be read."""
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     all_slots = np.arange(len(index))
 
@@ -103,7 +103,7 @@ def measure_look_alikes(
         """Select two places half the map away, as many as there are adjacent ones."""
         return np.isin(all_slots, (slot + len(index) // 2 + np.array([0, 1])) % len(index))
 
-    # Log agreement by the slots of both places. It depends slightly on which of the two pictures is the query.
+    # Log agreement by the slots of both places. It depends slightly on which of the two is the query.
     agreements: dict[int, dict[int, float]] = {slot: {} for slot in slots.values()}
     for place_id, descriptor in pictures:
         if (slot := slots.get(place_id)) is None:
@@ -117,21 +117,21 @@ def measure_look_alikes(
     best_opposite = [_find_best(others, select_opposite(slot))[1] for slot, others in agreements.items()]
     typical, chance = float(np.median(list(best_adjacent.values()))), log_share(CHANCE_SHARE)
     # Along a route, pictures agree better with the adjacent ones than with as many others.
-    overlap = typical >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
+    overlaps = typical >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
     places = {}
     for slot, others in agreements.items():
-        twin, agreement = _find_best(others, select_elsewhere(slot, MAX_NEIGHBOUR_SLOTS if overlap else 0))
-        own = max(typical, best_adjacent[slot]) if overlap else chance
-        if twin is not None:
-            twin_id = int(index.place_ids[twin])
-            places[int(index.place_ids[slot])] = LookAlike(twin_id, round(agreement, _DIGITS), round(own, _DIGITS))
-    return LookAlikes(overlap=overlap, places=places)
+        look_alike, agreement = _find_best(others, select_elsewhere(slot, MAX_NEIGHBOUR_SLOTS if overlaps else 0))
+        usual = max(typical, best_adjacent[slot]) if overlaps else chance
+        if look_alike is not None:
+            other_id = int(index.place_ids[look_alike])
+            places[int(index.place_ids[slot])] = LookAlike(other_id, round(agreement, _DIGITS), round(usual, _DIGITS))
+    return LookAlikes(overlap=overlaps, places=places)
 
 
-def _find_best(agreements: Mapping[int, float], selected: Bools) -> tuple[int | None, float]:
-    """Return the slot and the log agreement of the place that agrees best among those where `selected`, bool (N,), is
-    True. If no agreement is known for them, return None and the log of no agreement."""
-    slot = max((slot for slot in agreements if selected[slot]), key=agreements.__getitem__, default=None)
+def _find_best(agreements: Mapping[int, float], is_selected: Bools) -> tuple[int | None, float]:
+    """Return the slot and the log agreement of the best-agreeing place where `is_selected`, bool (N,), is True. If no
+    agreement is known there, return None and the log of no agreement."""
+    slot = max((slot for slot in agreements if is_selected[slot]), key=agreements.__getitem__, default=None)
     return slot, log_share(0.0) if slot is None else agreements[slot]
 
 
@@ -150,7 +150,7 @@ def _search_parts(
 
 @dataclass(frozen=True, slots=True)
 class FoundLookAlike:
-    """A place (its number), the place elsewhere that its picture matched, and the confidence of that match."""
+    """The id of a place, the id of the place elsewhere that its picture matched, and the confidence of that match."""
 
     place_id: int
     other_id: int
@@ -160,10 +160,10 @@ class FoundLookAlike:
 def find_look_alikes(
     place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask | None]]
 ) -> Iterator[FoundLookAlike | None]:
-    """Search the places elsewhere for each of the `pictures` (number of a place, its picture as encoded, the picture's
-    mask), and yield what looks like it (None: nothing does). Pictures that their place was not made from, and places
-    without a position, are skipped; nothing is yielded for a technique without a confidence. Raises MapError if the map
-    cannot be read."""
+    """Search the places elsewhere for each of the `pictures` (place id, its picture as encoded, the picture's mask),
+    and yield the place that looks like it (None: no such place). Skipped are places without a position, and pictures
+    from which their place was not made; nothing is yielded for a technique without a confidence. Raises MapError if the
+    map cannot be read."""
     technique = create_technique(place_map)
     if not list_evidence_kinds(technique.spec):
         return
@@ -174,10 +174,10 @@ def find_look_alikes(
         slot = search.slots.get(place_id)
         if slot is None or np.isnan(index.lat_deg[slot]):
             continue
-        away = index.select(~search.find_same_ground(slot))
-        if not len(away) or not place_map.has_descriptor(place_id, technique.encode(image, mask).coarse):
+        candidates = index.select(~search.find_same_ground(slot))
+        if not len(candidates) or not place_map.has_descriptor(place_id, technique.encode(image, mask).coarse):
             continue
-        event = search.find(place_id, image, mask, away)
+        event = search.find(place_id, image, mask, candidates)
         if event.best is None or event.confidence is None or event.confidence < MIN_LOOK_ALIKE_CONFIDENCE:
             yield None
         else:

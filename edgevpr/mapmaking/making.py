@@ -1,4 +1,4 @@
-"""Builds a complete map: makes places from pictures, then refines and calibrates them (`finishing`). The command
+"""Builds a complete map: makes places from pictures, then refines and calibrates the map (`finishing`). The command
 `edgevpr map build` calls it."""
 
 import logging
@@ -42,8 +42,8 @@ class MapPlan:
     """The map to make at `path` from `pictures`.
 
     `technique`: its name (None: choose one for `board`, the board that will fly). `parameters`: technique parameters by
-    name. `append`: add places to the map if it exists. `refine`, `calibrate`: also refine and calibrate the map once
-    its places are made."""
+    name. `append`: add places to the map if it exists. `refine`, `calibrate`: also refine and calibrate the map after
+    its places have been made."""
 
     path: str
     pictures: FlightPictures | OrthophotoGrid
@@ -72,7 +72,7 @@ class BuiltMap:
 
 
 def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], None], progress: Progress) -> BuiltMap:
-    """Make the map that `plan` describes, or continue it. `on_error` is called with the error of each picture that
+    """Make or continue the map that `plan` describes. `on_error` is called with the error of each picture that
     cannot be used. `progress` reports progress. Raises EdgevprError."""
     path, board, pictures = parse_map_path(plan.path), load_board("this"), plan.pictures
     source_config, salience = config.source, config.salience
@@ -146,8 +146,8 @@ def _open_flight(
     plan: MapPlan, pictures: FlightPictures, config: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures and create the technique: the requested one, else that of the map (`place_map` None: there is
-    no map yet), else the best for the board. Raises UsageError if the pictures look straight down but `--camera` is not
-    given, or if a camera that should look straight down is tilted and its angles are not recorded."""
+    no map yet), else the best for the board. Raises UsageError if the camera looks straight down but `--camera` is
+    missing, or if a camera that should look straight down is tilted and its angles are not recorded."""
     source, settings, camera = pictures.open(), plan.parameters, config.camera
     name = plan.technique or (place_map.spec.name if place_map is not None else None)
     needs_camera_check = camera is None and place_map is None and "camera" not in settings
@@ -157,7 +157,7 @@ def _open_flight(
         with show_elapsed("choosing a technique"):
             name = pick_technique(plan.board, source.total or 1, camera)
         settings = settings | make_camera_setting(name, camera)
-    elif camera:  # a technique without this setting refuses it
+    elif camera:  # a technique without this setting rejects it
         settings = settings | {"camera": camera}
     technique = _make_technique(plan, place_map, name, settings)
     if technique.spec.looks_down and not config.gimbal and read_mount(config) == STRAIGHT_DOWN:
@@ -171,7 +171,7 @@ def _open_orthophoto(
     """Open the orthophoto and create the technique: the requested one, else that of the map (`place_map` None: there is
     no map yet), else `cohog`. Raises UsageError for a camera other than nadir."""
     if camera not in (None, "nadir"):
-        raise UsageError(f"--camera {camera}: an orthophoto is seen from above: give --camera nadir, or omit it.")
+        raise UsageError(f"--camera {camera}: an orthophoto is seen from above, so pass --camera nadir, or omit it.")
     name = plan.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
     settings = plan.parameters | make_camera_setting(name, "nadir")
     return pictures.open(), _make_technique(plan, place_map, name, settings)
@@ -179,6 +179,6 @@ def _open_orthophoto(
 
 def _make_technique(plan: MapPlan, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:
     board = load_board("this")
-    if place_map is not None:  # a map without places is falsy
+    if place_map is not None:  # not just `if place_map`: a map without places is falsy
         return create_technique(place_map, plan.technique, settings, board)
     return make_technique(board.threads, name, settings)

@@ -2,7 +2,7 @@
 
 With salience criteria (`FrameEncoder.gate`), only frames that reach all thresholds become places. To avoid long gaps
 (thesis 3.4.8), the other frames wait. After `max_frames` frames or `max_gap_m` metres without a place, all thresholds
-are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
+are lowered in steps of 0.03 until some waiting frames pass; these become low-quality places.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -47,7 +47,7 @@ class PlaceSelector:
             yield from self._take_best_waiting()
         if encoded.salience.reason is None:
             self._waiting.clear()
-            yield self._keep(encoded), encoded.salience.scores
+            yield self._record_place(encoded), encoded.salience.scores
         else:
             self._last = self._last or frame.position
             self._waiting.append(replace(encoded, frame=replace(frame, image=_NO_PIXELS)))
@@ -58,15 +58,15 @@ class PlaceSelector:
             yield from self._take_best_waiting()
 
     def _take_best_waiting(self) -> Iterator[SelectedFrame]:
-        """Yield the best waiting frames as places of low quality. Other frames before the last yielded one are dropped;
+        """Yield the best waiting frames as low-quality places. Other frames before the last yielded one are dropped;
         those after it continue to wait."""
         waiting = [(encoded, encoded.salience) for encoded in self._waiting if encoded.salience]
         best = np.flatnonzero(select_best([salience.shortfall for _, salience in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
         for encoded, salience in (waiting[index] for index in best):
-            yield self._keep(encoded), replace(salience.scores, is_low=True)
+            yield self._record_place(encoded), replace(salience.scores, is_low=True)
 
-    def _keep(self, encoded: EncodedFrame) -> EncodedFrame:
+    def _record_place(self, encoded: EncodedFrame) -> EncodedFrame:
         self._has_begun, self._last = True, encoded.frame.position or self._last
         return encoded
 
@@ -91,8 +91,8 @@ class CoveredGround:
     def describe(self, is_flown: bool) -> str:
         """Describe the ground in one sentence, including the track if the pictures were taken in flight."""
         lengths_m = self.north_south_m, self.east_west_m, self.track_m, self.step_m
-        high, wide, track, step = (f"{m / 1000:.1f} km" if m >= 1000 else f"{m:.0f} m" for m in lengths_m)
-        text = f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
+        ns, ew, track, step = (f"{m / 1000:.1f} km" if m >= 1000 else f"{m:.0f} m" for m in lengths_m)
+        text = f"the map extends {ns} north-south and {ew} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
         return f"{text}; the track is {track} long, with a median of {step} between pictures" if is_flown else text
 
 
@@ -118,7 +118,7 @@ def measure_ground(place_map: PlaceMap) -> CoveredGround | None:
 
 @dataclass(slots=True, kw_only=True)
 class MappingResult:
-    """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
+    """Counts of frames. `added`: new places; `without_position` of these have no position, and `of_low_quality` only
     close a gap. `already_here`: frames that were in the map already. `low_texture`: frames with too little texture.
     `tilted`: frames tilted too far to be levelled. `without_heading`: tilted frames that lack the heading needed to
     level them. `not_memorable`: frames skipped because they failed a salience criterion. `without_data`: places skipped
@@ -145,7 +145,7 @@ def build_map(
 ) -> MappingResult:
     """Add a place for every selected frame that is not in the map yet, so that an interrupted build can be continued.
 
-    Frames are encoded by the same steps as queries. A frame is in the map already if a place has the same name and
+    Frames are encoded in the same steps as queries. A frame is in the map already if a place has the same name and
     nearly the same descriptor; the name alone is not enough, because cameras restart their numbering. If a frame cannot
     be encoded, `on_error` is called with the error; with `on_error` None, ModelError is raised. Pictures cut from an
     orthophoto (surveyed ones) are skipped if they have too little texture to be recognised.

@@ -1,5 +1,5 @@
-"""Reads the area of a flight: the path in a waypoint file or QGroundControl plan, or a circle. The area limits which
-part of an orthophoto becomes a map, and which part of a map is cut out for a flight."""
+"""Reads the area of a flight: the path in a waypoint file or QGroundControl plan, or a circle. The area limits the part
+of an orthophoto that becomes a map, and the part of a map that is cut out for a flight."""
 
 import json
 import math
@@ -24,12 +24,12 @@ except ModuleNotFoundError as error:
 _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
 # The MAV_CMDs that fly to their position: waypoint, loiter (unlimited, turns, time, to altitude), land, takeoff, spline
-# waypoint, VTOL takeoff and VTOL land. The position of others, such as a region of interest, is only looked at.
+# waypoint, VTOL takeoff and VTOL land. With other commands, such as a region of interest, the camera only points at it.
 _NAV_COMMANDS = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
 _RELATIVE_FRAMES = {3, 6, 10, 11}  # MAV_FRAMEs with altitude relative to home or the terrain
 _CIRCLE_PATTERN = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
 _MAX_RADIUS_M = 200_000.0
-_QUARTER_SEGMENTS = 64  # segments per quarter circle of a buffer: exact to 0.01 % of its width
+_QUARTER_SEGMENTS = 64  # segments per quarter circle of a buffer: accurate to 0.01 % of its width
 _FAR_M = 1e8
 _MALFORMED = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError)
 
@@ -72,8 +72,8 @@ class Area:
 
 
 def read_area(path: str | Path) -> Area:
-    """Read a waypoint file (QGC WPL 110), a QGroundControl .plan, or a circle given as the text LAT,LON,RADIUS_M.
-    Raises UsageError if the file has neither format, contains no position, or has a position outside -90..90 or
+    """Read a waypoint file (QGC WPL 110), a QGroundControl .plan, or a circle in the form LAT,LON,RADIUS_M.
+    Raises UsageError if the file has neither format, contains no waypoints, or has a position outside -90..90 or
     -180..180 degrees."""
     try:
         if _CIRCLE_PATTERN.fullmatch(str(path)):
@@ -83,14 +83,14 @@ def read_area(path: str | Path) -> Area:
         waypoints = _read_waypoints(text.splitlines()) if is_wpl else _read_plan(json.loads(text)["mission"]["items"])
     except OSError as error:
         raise UsageError(
-            f"{path} cannot be read ({error.strerror}): give a mission file, or LAT,LON,RADIUS_M."
+            f"{path} cannot be read ({error.strerror}): pass a mission file, or LAT,LON,RADIUS_M."
         ) from error
     except _MALFORMED:
         raise UsageError(
             f"{path} is not a valid waypoint file (QGC WPL 110) or QGroundControl .plan: save the mission again."
         ) from None
     if not waypoints:
-        raise UsageError(f"{path} contains no position to fly to: save the mission again.")
+        raise UsageError(f"{path} contains no waypoints: save the mission again.")
     if any(abs(wp.lat_deg) > 90 or abs(wp.lon_deg) > 180 for wp in waypoints):
         raise UsageError(f"{path} has invalid coordinates: positions must be WGS-84 degrees (-90..90, -180..180).")
     return Area(tuple(waypoints))
@@ -99,8 +99,8 @@ def read_area(path: str | Path) -> Area:
 def _make_circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
     if not (abs(lat_deg) < 90 and abs(lon_deg) <= 180 and 0 < radius_m <= _MAX_RADIUS_M):
         raise UsageError(
-            f"--area {lat_deg:g},{lon_deg:g},{radius_m:g} is not a valid circle: write LAT,LON,RADIUS_M, in WGS-84 "
-            f"degrees and metres (at most {_MAX_RADIUS_M:,.0f})."
+            f"--area is {lat_deg:g},{lon_deg:g},{radius_m:g}, but a circle must be LAT,LON,RADIUS_M, in WGS-84 degrees "
+            f"and metres (at most {_MAX_RADIUS_M:,.0f})."
         )
     return Area((Waypoint(lat_deg, lon_deg),), radius_m)
 
@@ -117,18 +117,18 @@ def _read_waypoints(lines: list[str]) -> list[Waypoint]:
 
 
 def _parse_waypoint(command: int, frame: int, location: Sequence[float | str | None]) -> list[Waypoint]:
-    """Return a list with the waypoint of a mission item, empty if the aircraft does not fly to it. `command` is a
+    """Return a list with the waypoint of a mission item; empty if the aircraft does not fly to it. `command` is a
     MAV_CMD, `frame` a MAV_FRAME, `location` latitude, longitude and altitude; (0, 0) is the aircraft's own position."""
     lat_deg, lon_deg, alt_m = map(_parse_finite, location)
     if command not in _NAV_COMMANDS or lat_deg == lon_deg == 0:
         return []
-    # No pictures are taken from height 0, as at home and on landing, so it counts as missing.
+    # No pictures are taken from height 0, as at home or on landing, so this height counts as missing.
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _RELATIVE_FRAMES and alt_m > 0 else None)]
 
 
 def _read_plan(items: list[dict[str, Any]]) -> list[Waypoint]:
     """Read the items of a plan: simple items, surveys and corridor scans, which store the waypoints computed from their
-    polygon, and structure scans, which have a polygon only. Numbers left to the autopilot are null."""
+    polygon, and structure scans, which have only a polygon. Values that are left to the autopilot are null."""
     path: list[Waypoint] = []
     for item in items:
         if item["type"] == "SimpleItem":
@@ -136,7 +136,7 @@ def _read_plan(items: list[dict[str, Any]]) -> list[Waypoint]:
             continue
         style = item.get("TransectStyleComplexItem", {})
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
-        outline = item.get("polygon", ())  # which a structure scan flies along
+        outline = item.get("polygon", ())  # the path of a structure scan
         points = style.get("VisualTransectPoints") or (*outline, *outline[:1])
         path += [Waypoint(_parse_finite(lat_deg), _parse_finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
     return path

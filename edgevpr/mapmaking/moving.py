@@ -1,4 +1,4 @@
-"""Moves a map to match GPS, by the offset and scale that a flight measured (see `runtime.flight.survey`, which writes
+"""Moves a map to match GPS, by the offset and scale measured in a flight (see `runtime.flight.survey`, which writes
 lines of kind "survey" to the flight log). The command `edgevpr map move` calls it.
 """
 
@@ -18,7 +18,7 @@ from edgevpr.runtime.flight.flightlog import select_last_flight
 class MapMove:
     """A move of a map with `places` places. Its centre `middle` (latitude and longitude in degrees) moves by `east_m`
     and `north_m`, with a standard deviation of `sd_m`. Distances from the centre are divided by 1 + `scale` (None: the
-    flight could not measure the scale, so they stay)."""
+    flight could not measure the scale, so they are unchanged)."""
 
     places: int
     middle: tuple[float, float]
@@ -29,16 +29,16 @@ class MapMove:
 
     def apply(self, position: Position) -> Position:
         """Return the moved position."""
-        away_m = offset_m(*self.middle, position.lat_deg, position.lon_deg)
-        east_m, north_m = (distance_m / (1 + (self.scale or 0.0)) for distance_m in map(float, away_m))
+        offsets_m = offset_m(*self.middle, position.lat_deg, position.lon_deg)
+        east_m, north_m = (distance_m / (1 + (self.scale or 0.0)) for distance_m in map(float, offsets_m))
         lat_deg, lon_deg = offset_position(*self.middle, east_m + self.east_m, north_m + self.north_m)
         return replace(position, lat_deg=lat_deg, lon_deg=lon_deg)
 
 
 def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
-    """Move all places of a map that is open for adding, in one transaction, by the last survey result in a flight log.
-    Raises UsageError if the log has no result, or comes from another map or another version of this one. Raises
-    MapError as `PlaceMap` does."""
+    """Move all places of a map that is open for writing, in one transaction, by the last survey result in a flight log.
+    Raises UsageError if the log has no result, or is from another map or another version of this one. Raises MapError
+    as `PlaceMap` does."""
     survey, identity = None, None
     for line in select_last_flight(log):
         if line["kind"] == "start":
@@ -47,8 +47,8 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
             survey = line
     if identity != asdict(read_identity(place_map)):
         raise UsageError(
-            f"{log} was not recorded with {place_map.path} as it is now: it comes from another map, or this map was "
-            "changed or moved since: give the log of a flight with this map."
+            f"{log} was not recorded with the current {place_map.path} (it is from another map, or this map has since "
+            "been changed or moved). Pass the log of a flight with this map."
         )
     move = _read_move(survey or {}, len(place_map))
     if move is None:

@@ -25,8 +25,8 @@ from edgevpr.mapmaking.georaster import (
     transform,
 )
 
-_EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
-_MAX_HALVINGS = 8  # of the resolution: reduces a tile of 256 pixels to one
+_EDGE_POINTS = 25  # per edge, because a straight edge of the file is a curve in another coordinate system
+_MAX_HALVINGS = 8  # of the resolution; eight reduce a tile of 256 pixels to one
 
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
@@ -40,10 +40,10 @@ class Orthophoto:
         """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads. Raises SourceError."""
         path = Path(source)
         if not path.exists():
-            raise SourceError(f"{source} does not exist: give an orthophoto (GDAL makes one of a server's tiles).")
+            raise SourceError(f"{source} does not exist: use an orthophoto (GDAL can make one from a tile server).")
         if path.is_dir():
             raise SourceError(
-                f"{source} is a folder: give a file. GDAL makes one of a folder of tiles "
+                f"{source} is a folder, but must be a file. GDAL can make one from a folder of tiles "
                 "(docs/how-to/map-from-an-orthophoto.md)."
             )
         self.name, self.short_name = str(path), path.name
@@ -122,7 +122,7 @@ class Orthophoto:
         warped = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
         picture = resize(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8
         warped = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
-        # Only pixels that are entirely data: those at the edge are mixed with black and would outline the data.
+        # Use only pure data pixels: those at the edge are mixed with black and would outline the data.
         has_data = resize(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
         if has_data.any():
             picture[~has_data] = picture[has_data].mean(axis=0)

@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 SIDE_PX = 512
-MAX_WITHOUT_DATA = 0.1  # share of a picture's pixels
+MAX_WITHOUT_DATA = 0.1  # fraction of a picture's pixels
 _GEOREFERENCE_SD_M = 1.0  # standard deviation of the orthophoto's georeference along each axis
-# Pixels of the raster along the side of a picture, from benchmarks/results/from_space.md. Below the first limit recall
+# Raster pixels along the side of a picture, from benchmarks/results/from_space.md. Below the first limit recall
 # falls; below the second nothing is recognised.
 _SHARP_WIDTH_PX = 150
 _MIN_WIDTH_PX = 32
 _MIN_WHITE = 200  # a pixel is white if each of its colours is at least this bright (0..255)
 _MAX_COLOUR_DIFFERENCE = 30  # and its colours differ by less than this
-_MIN_CLOUDY_SHARE = 1 / 3  # share of white pixels in a picture; in seven sets without clouds it is at most a sixth
-_METADATA_BYTES = 10_000  # per place in a map file besides its descriptor: mainly landmarks
+_MIN_CLOUDY_FRACTION = 1 / 3  # of white pixels in a picture; in seven sets without clouds it is at most a sixth
+_METADATA_BYTES = 10_000  # per place in a map file in addition to its descriptor, mainly landmarks
 _MAX_PLACES = 1_000_000
 _MAX_GRID_POINTS = 20 * _MAX_PLACES  # in the bounding box of an area, before points outside the area are dropped
 
@@ -91,9 +91,9 @@ class OrthophotoSource(RecordingSource):
         self._read += 1
         if self._read == self.total:
             self.end()
-        numbers = zip((lattice.rows[index], lattice.columns[index]), lattice.shape, strict=True)
+        grid_indices = zip((lattice.rows[index], lattice.columns[index]), lattice.shape, strict=True)
         # Leading zeros make the names sort in grid order.
-        row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in numbers)
+        row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in grid_indices)
         footprint_suffix = f"_{lattice.footprint_m:g}m" if len(self._lattices) > 1 else ""
         name = f"{self.short_name}{footprint_suffix}_r{row}_c{column}"
         if not self.is_selected(name):
@@ -107,12 +107,12 @@ class OrthophotoSource(RecordingSource):
         if valid.mean() < 1 - MAX_WITHOUT_DATA:
             self.counts["without_data"] += 1
             return None
-        self.counts["white"] += _compute_white_share(image) > _MIN_CLOUDY_SHARE
+        self.counts["white"] += _compute_white_fraction(image) > _MIN_CLOUDY_FRACTION
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
 
     def announce_size(self, spacing_m: float, technique: Technique) -> None:
-        """Log how many places will be extracted, and their ground area, size and resolution."""
+        """Log the number of places to be extracted, and their ground area, size and resolution."""
         lattice = min(self._lattices, key=lambda lattice: lattice.footprint_m)
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _METADATA_BYTES
@@ -137,8 +137,8 @@ class OrthophotoSource(RecordingSource):
         self._orthophoto.close()
 
 
-def _compute_white_share(image: Image) -> float:
-    """Return the share of white pixels in a picture."""
+def _compute_white_fraction(image: Image) -> float:
+    """Return the fraction of white pixels in a picture."""
     blue, green, red = cv2.split(image)
     low, high = cv2.min(cv2.min(blue, green), red), cv2.max(cv2.max(blue, green), red)
     return float(((low > _MIN_WHITE) & (high - low < _MAX_COLOUR_DIFFERENCE)).mean())
@@ -153,7 +153,7 @@ def open_orthophoto(grid: "OrthophotoGrid", only: Collection[str] | None) -> Ort
     if (side_px := footprints_m[0] / orthophoto.resolution_m) < _MIN_WIDTH_PX:
         raise UsageError(
             f"{orthophoto.name} is too coarse: a picture of {footprints_m[0]:g} m is {side_px:.0f} pixels wide, and "
-            f"fewer than {_MIN_WIDTH_PX} cannot be recognised: give an orthophoto of higher resolution."
+            f"fewer than {_MIN_WIDTH_PX} cannot be recognised: use an orthophoto of higher resolution."
         )
     return OrthophotoSource(orthophoto, lattices, only=only)
 
@@ -175,8 +175,8 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     ):
         if not 0 < value_m <= max_m:  # also catches NaN
             raise UsageError(
-                f"{flag} is {value_m:g}, but {orthophoto.name} measures {size_m[0]:.0f} m by {size_m[1]:.0f} m: give a "
-                "value above 0 that fits into it."
+                f"{flag} is {value_m:g}, but must be above 0 and fit into {orthophoto.name}, which measures "
+                f"{size_m[0]:.0f} m by {size_m[1]:.0f} m."
             )
     low, high = low + footprint_m / 2, high - footprint_m / 2
     count = ((high - low) / spacing_m).astype(int) + 1
@@ -205,7 +205,7 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     _require_at_most(len(rows), _MAX_PLACES, spacing_m)
     if not len(rows):
         raise UsageError(
-            f"No point of a {spacing_m:g} m grid lies inside both the area and {orthophoto.name}: give a smaller "
+            f"No point of a {spacing_m:g} m grid is inside both the area and {orthophoto.name}: use a smaller "
             "--spacing-m."
         )
     lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
@@ -219,7 +219,7 @@ def _require_at_most(count: int, max_count: int, spacing_m: float) -> None:
         needed_m = math.ceil(spacing_m * math.sqrt(count / _MAX_PLACES))
         raise UsageError(
             f"A {spacing_m:g} m grid has {count:,} points here, but a map can hold at most {_MAX_PLACES:,} places: "
-            f"give --spacing-m {needed_m}, or limit the map with --area."
+            f"pass --spacing-m {needed_m}, or limit the map with --area."
         )
 
 

@@ -33,7 +33,7 @@ class FlightPictures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrthophotoGrid:
-    """A grid of pictures cut from an orthophoto.
+    """A grid of pictures to cut from an orthophoto.
 
     `orthophoto`: see `Orthophoto`. `footprint_m`: length of a picture's side on the ground, or several lengths, each of
     which gets a grid of its own. `spacing_m`: distance between neighbouring points. `area`: file or circle that limits

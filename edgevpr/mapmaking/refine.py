@@ -5,11 +5,11 @@ Each place gets a pose: the direction and footprint of its picture, and a positi
 mounting of the camera need not be known. A place connected by ties (see `graph`) to too few others keeps its recorded
 position and gets no pose.
 
-Only pairs that may overlap are compared: places recorded near each other, and places mapped one after the other, since
-a recorded position may be far off. Once the pose graph is solved, pairs that overlap in the solution are compared too.
-Landmarks (ORB points), the most accurate, are compared first. If too few of them agree and the pictures are available,
-the technique compares their regions as in flight, which gives a rough relative pose ("vote"); landmarks are then
-compared again near that pose.
+Only pairs that may overlap are compared: places recorded near each other, and, because a recorded position may be far
+off, places mapped one after the other. After the pose graph is solved, pairs that overlap in the solution are compared
+too. Landmarks (ORB points), the most accurate, are compared first. If too few of them agree and the pictures are
+available, the technique compares their regions as in flight, which yields a rough relative pose ("vote"); landmarks are
+then compared again near that pose.
 """
 
 from collections.abc import Callable, Iterator
@@ -36,18 +36,18 @@ from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVE
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 
 _MIN_GROUP = 4  # places connected by ties; three cannot reveal an error in scale
-_MAX_LOG_SD = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
-# If the misfit of recorded positions to the ties exceeds this share of their spread, their mirror images are tried; one
-# is right if its misfit is less than this ratio of theirs. Correct sets have 0.01 to 0.36, and their mirror images at
-# least 1.3 times as much, also with 20 m of noise. With lat and lon exchanged, sets have 0.18 to 1.0, and their mirror
-# images at most 0.7 times as much.
+_MAX_LOG_SD = 0.15  # maximum standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
+# If the misfit between recorded positions and ties exceeds this fraction of their spread, their mirror images are
+# tried; one is right if its misfit is below this ratio of the original one. Correct sets have 0.01 to 0.36, and their
+# mirror images at least 1.3 times as much, also with 20 m of noise. With lat and lon exchanged, sets have 0.18 to 1.0,
+# and their mirror images at most 0.7 times as much.
 _MIN_MISFIT = 0.15
 _MAX_MIRRORED_RATIO = 0.75
-_MAX_MIRROR_PLACES = 300  # places that the mirror image is fitted to
+_MAX_MIRROR_PLACES = 300  # places to which the mirror image is fitted
 _NEAREST_PLACES = 8  # each place is compared with this many of the places recorded nearest to it
 _PREVIOUS_PLACES = 2  # and with this many of the places mapped just before it
-_MAX_OVERLAP_DISTANCE = 0.6  # between centres, in longest sides: within it, pictures share at least a third
-_MAX_OVERLAPPING = 12  # pairs per place once the graph is solved
+_MAX_OVERLAP_DISTANCE = 0.6  # between centres, in longest sides; closer pictures share at least a third
+_MAX_OVERLAPPING = 12  # pairs per place after the graph is solved
 # Chosen on aerial_caliterra and aerial_garfield28. Among their pairs without enough landmarks, and those of three other
 # sets, no vote with 0.02 or more was wrong; among pairs with landmarks near the vote, none was.
 _MIN_VOTE_SCORE = 0.025  # to use a vote without landmarks
@@ -63,9 +63,9 @@ _CACHED_DESCRIPTORS = 4
 
 class Tie(NamedTuple):
     """Relative pose of two pictures, `query` to `place`. `step`: complex offset from the centre of the place's picture
-    to the centre of the query's (right + i up, in shares of the longest side of the place's picture). `turn`: complex,
-    log(scale) + i counter-clockwise rotation in radians. `step_sd`, `turn_sd`: standard deviations of `step` and `turn`
-    along one axis."""
+    to the centre of the query's (right + i up, as fractions of the longest side of the place's picture). `turn`:
+    complex, log(scale) + i counter-clockwise rotation in radians. `step_sd`, `turn_sd`: standard deviations of `step`
+    and `turn` along one axis."""
 
     step: complex
     turn: complex
@@ -73,19 +73,19 @@ class Tie(NamedTuple):
     turn_sd: float
 
 
-Pair = tuple[int, int]  # the numbers of query and place, the later one first
+Pair = tuple[int, int]  # the indices of query and place, the later one first
 ComparePair = Callable[[int, int], Tie | None]  # compares a pair (query, place); None: no tie
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refinement:
     """Result of refining a map with `places` places. Of these, `without_position` have no position, `surveyed` were cut
-    from an orthophoto and are left as they are, and `refined` now have a pose; the others had too few ties. `ties`:
-    number of ties that agree with the solution. `recorded_sd_m`: standard deviation of recorded positions along one
-    axis. `moved_m`, `position_sd_m`, `footprint_m`: medians of how far places moved, of the standard deviations of
-    refined positions, and of footprints (None: no place).
-    `contradictory`: places whose recorded position contradicts the pictures (see `find_inconsistent_tags`): (number,
-    image, metres between the two).
+    from an orthophoto and are not changed, and `refined` now have a pose; the others had too few ties. `ties`: number
+    of ties that agree with the solution. `recorded_sd_m`: standard deviation of recorded positions along one axis.
+    `moved_m`, `position_sd_m`, `footprint_m`: medians of the distances by which places moved, of the standard
+    deviations of refined positions, and of footprints (None: no place).
+    `contradictory`: places whose recorded position contradicts the pictures (see `find_inconsistent_tags`): (place id,
+    image, metres between recorded and refined position).
     `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined."""
 
     places: int
@@ -107,34 +107,34 @@ def refine(
     progress: Progress,
     images: str | Path | None = None,
 ) -> Refinement:
-    """Refine a map that is open for adding, in one transaction. `progress` wraps the iteration over the pairs of
+    """Refine a map that is open for writing, in one transaction. `progress` wraps the iteration over the pairs of
     places. `images` is the folder of the map's pictures (None: not available, so only the landmarks in the map are
     compared). Raises MapError if the map file cannot be read or written.
     """
     places = list(_read_places(place_map))
-    with_position = [place for place in places if place.position]
-    placed = [place for place in with_position if not (place.pose and place.pose.is_surveyed)]
+    located = [place for place in places if place.position]
+    refinable = [place for place in located if not (place.pose and place.pose.is_surveyed)]
     result = Refinement(
         places=len(places),
-        without_position=len(places) - len(with_position),
-        surveyed=len(with_position) - len(placed),
+        without_position=len(places) - len(located),
+        surveyed=len(located) - len(refinable),
     )
-    if not placed:
+    if not refinable:
         return result
-    positions = [_get_recorded_position(place) for place in placed]
+    positions = [_get_recorded_position(place) for place in refinable]
     east_m, north_m = project_to_metres(*np.array([(position.lat_deg, position.lon_deg) for position in positions]).T)
     recorded = east_m + 1j * north_m
-    compare_pair = _make_comparer(place_map, technique, placed, images)
+    compare_pair = _make_comparer(place_map, technique, refinable, images)
     pairs = _find_likely_pairs(recorded)
     ties = {pair: tie for pair in progress(pairs, len(pairs), "refining") if (tie := compare_pair(*pair))}
     solved = solve_graph(recorded, _to_ties(ties))
-    more = sorted(set(_find_overlapping_pairs(solved.position, solved.log, _is_determined(solved))) - set(pairs))
-    if more:
-        ties |= {pair: tie for pair in progress(more, len(more), "refining") if (tie := compare_pair(*pair))}
+    new_pairs = sorted(set(_find_overlapping_pairs(solved.position, solved.log, _is_determined(solved))) - set(pairs))
+    if new_pairs:
+        ties |= {pair: tie for pair in progress(new_pairs, len(new_pairs), "refining") if (tie := compare_pair(*pair))}
         solved = solve_graph(recorded, _to_ties(ties))
     is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solved)
     refined = _is_determined(solved) & (not is_mirrored)
-    _write_poses(place_map, placed, positions, solved, refined)
+    _write_poses(place_map, refinable, positions, solved, refined)
     moved_m = abs(solved.position - recorded)[refined]
     members = np.flatnonzero(refined)
     return replace(
@@ -146,7 +146,7 @@ def refine(
         position_sd_m=_find_median(np.sqrt(solved.position_var[refined] / 2)),
         footprint_m=_find_median(np.exp(solved.log.real[refined])),
         contradictory=tuple(
-            (placed[members[row]].place_id, placed[members[row]].source_image, float(moved_m[row]))
+            (refinable[members[row]].place_id, refinable[members[row]].source_image, float(moved_m[row]))
             for row in np.flatnonzero(find_inconsistent_tags(moved_m))
         ),
         is_mirrored=is_mirrored,
@@ -154,14 +154,14 @@ def refine(
 
 
 def _get_recorded_position(place: Place) -> Position:
-    """Return the position of a place as it was before any refinement."""
+    """Return the position that a place had before any refinement."""
     position = place.pose.recorded if place.pose and place.pose.recorded else place.position
     assert position is not None  # callers pass only places with a position
     return position
 
 
 def _is_determined(solved: GraphSolution) -> Bools:
-    """Return bool (N,), True for places in a large enough group whose solution is accurate enough to give a pose."""
+    """Return bool (N,), True for places in a large enough group whose solution is accurate enough for a pose."""
     group_size = np.bincount(solved.component)[solved.component]
     is_determined: Bools = (group_size >= _MIN_GROUP) & (solved.log_var / 2 <= _MAX_LOG_SD**2)
     return is_determined
@@ -169,7 +169,7 @@ def _is_determined(solved: GraphSolution) -> Bools:
 
 def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, solved: GraphSolution) -> bool:
     """Return True if the ties fit a mirror image of the recorded positions much better than the positions themselves,
-    as when lat and lon are exchanged or a sign is lost. Places on a straight line or in small groups do not show it."""
+    as when lat and lon are exchanged or a sign is wrong. Places on a straight line or in small groups hide it."""
     sample = slice(_MAX_MIRROR_PLACES)
     misfit = _compute_misfit(recorded, solved, sample)
     if misfit < _MIN_MISFIT:
@@ -186,15 +186,15 @@ def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, sol
 
 
 def _compute_misfit(recorded: Complexes, solved: GraphSolution, sample: slice) -> float:
-    """Return the median distance between recorded and solved positions in `sample`, as a share of the spread of the
-    recorded ones. Only large enough groups of places connected by ties count; 0 if there is none."""
+    """Return the median distance between recorded and solved positions in `sample`, divided by the spread of the
+    recorded ones. Only large enough groups of places connected by ties are used; 0 if there is none."""
     component, position = solved.component[sample], recorded[sample]
     size = np.bincount(component)
-    counts = size[component] >= _MIN_GROUP
-    if not counts.any():
+    is_used = size[component] >= _MIN_GROUP
+    if not is_used.any():
         return 0.0
     mean = (np.bincount(component, position.real) + 1j * np.bincount(component, position.imag)) / np.maximum(size, 1)
-    error_m, spread_m = abs(solved.position[sample] - position)[counts], abs(position - mean[component])[counts]
+    error_m, spread_m = abs(solved.position[sample] - position)[is_used], abs(position - mean[component])[is_used]
     return float(np.median(error_m) / max(np.median(spread_m), 1e-9))
 
 
@@ -205,13 +205,13 @@ def _read_places(place_map: PlaceMap) -> Iterator[Place]:
 
 
 def _write_poses(
-    place_map: PlaceMap, placed: list[Place], positions: list[Position], solved: GraphSolution, refined: Bools
+    place_map: PlaceMap, refinable: list[Place], positions: list[Position], solved: GraphSolution, refined: Bools
 ) -> None:
     """Write the solved positions and poses to the map for places where `refined`, bool (N,), is True. The others are
     reset to their recorded positions, without a pose."""
     origin = positions[0]
     with place_map.transaction():
-        for index, place in enumerate(placed):
+        for index, place in enumerate(refinable):
             position, pose = positions[index], None
             if refined[index]:
                 var_m2, offset_m = float(solved.position_var[index]) / 2, solved.position[index]
@@ -241,38 +241,38 @@ def _find_overlapping_pairs(position: Complexes, log: Complexes, selected: Bools
     """Return the pairs of places that overlap in a solved graph. `position` and `log` are those of
     `graph.GraphSolution`; only places where `selected`, bool (N,), is True are considered."""
     members, footprint_m = np.flatnonzero(selected), np.exp(log.real[selected])
-    near = _pair_nearest(position[members], _MAX_OVERLAPPING)
+    pairs = _pair_nearest(position[members], _MAX_OVERLAPPING)
     return sorted(
         {
             (int(members[later]), int(members[earlier]))
-            for later, earlier, away_m in near
-            if away_m <= _MAX_OVERLAP_DISTANCE * min(footprint_m[later], footprint_m[earlier])
+            for later, earlier, distance_m in pairs
+            if distance_m <= _MAX_OVERLAP_DISTANCE * min(footprint_m[later], footprint_m[earlier])
         }
     )
 
 
 def _pair_nearest(position: Complexes, count: int) -> Iterator[tuple[int, int, float]]:
-    """Pair each of N places, at `position`, complex (N,) metres, with the `count` places nearest to it. Yields (number
-    of the later place, number of the earlier place, metres between them) for each pair; some pairs occur twice."""
+    """Pair each of N places, at `position`, complex (N,) metres, with the `count` places nearest to it. Yields (index
+    of the later place, index of the earlier place, metres between them) for each pair; some pairs occur twice."""
     if len(position) > 1:
         points = np.stack([position.real, position.imag], axis=1)
-        away_m, near = cKDTree(points).query(points, k=min(count + 1, len(points)))
-        for (place, rank), other in np.ndenumerate(near):
+        distances_m, neighbours = cKDTree(points).query(points, k=min(count + 1, len(points)))
+        for (place, rank), other in np.ndenumerate(neighbours):
             if other != place:
-                yield max(place, int(other)), min(place, int(other)), float(away_m[place, rank])
+                yield max(place, int(other)), min(place, int(other)), float(distances_m[place, rank])
 
 
-def _to_ties(tie_of: dict[Pair, Tie]) -> Ties:
+def _to_ties(ties_by_pair: dict[Pair, Tie]) -> Ties:
     """Convert ties to the arrays that `graph.solve_graph` expects."""
-    query, place = np.array(list(tie_of), np.intp).reshape(-1, 2).T
-    step, turn, step_sd, turn_sd = np.array(list(tie_of.values()), complex).reshape(-1, 4).T
+    query, place = np.array(list(ties_by_pair), np.intp).reshape(-1, 2).T
+    step, turn, step_sd, turn_sd = np.array(list(ties_by_pair.values()), complex).reshape(-1, 4).T
     return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)
 
 
 def _make_comparer(
     place_map: PlaceMap, technique: Technique, places: list[Place], images: str | Path | None
 ) -> ComparePair:
-    """Return a function that compares two of `places`, given by index, and returns their tie (None: no tie). `images`
+    """Return a function that compares two of `places`, passed by index, and returns their tie (None: no tie). `images`
     is the folder of their pictures (None: not available, so only landmarks are compared)."""
     paths = {decode_name(path.name): path for path in list_images(images)} if images else {}
     coarse = {place_id: part for place_id, *_, part in place_map.read_coarse_parts()}
@@ -296,8 +296,8 @@ def _make_comparer(
         return descriptor if place_map.has_descriptor(places[index].place_id, descriptor.coarse) else None
 
     def compare_landmarks(query: int, place: int, expected: Overlay | None, min_inliers: int) -> Tie | None:
-        one, other = read_landmarks(query), read_landmarks(place)
-        pose = None if one is None or other is None else measure_agreement(one, other, expected)
+        first, second = read_landmarks(query), read_landmarks(place)
+        pose = None if first is None or second is None else measure_agreement(first, second, expected)
         if pose is None or pose.inliers < min_inliers or pose.shift_share is None or pose.rotation_deg is None:
             return None
         overlay = Overlay(pose.shift_share, pose.rotation_deg, pose.scale)
@@ -327,8 +327,8 @@ def _make_comparer(
 def _rank_hypotheses(technique: Technique, query: Descriptor, coarse: Array) -> list[int]:
     """Return the numbers of the hypotheses of rotation and height that `Technique.match` should test for a query and a
     place: the eight that score best against the coarse part of the place, best first."""
-    _, by_hypothesis = technique.score_places(query, coarse[None], None)
-    assert by_hypothesis is not None  # set by techniques for a camera that looks down
-    best = np.argsort(-by_hypothesis[0], kind="stable")[:_MAX_HYPOTHESES]
-    ranked: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
+    _, hypothesis_scores = technique.score_places(query, coarse[None], None)
+    assert hypothesis_scores is not None  # set by techniques for a camera that looks down
+    best = np.argsort(-hypothesis_scores[0], kind="stable")[:_MAX_HYPOTHESES]
+    ranked: list[int] = best[np.isfinite(hypothesis_scores[0][best])].tolist()
     return ranked

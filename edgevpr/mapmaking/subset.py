@@ -17,7 +17,7 @@ from edgevpr.places.mapfile import PlaceMap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subset:
-    """A map made for one flight. `maps`: number of maps that it was made from. `near`: number of places near the
+    """A map made for one flight. `maps`: number of maps from which it was made. `near`: number of places near the
     mission; the best `places` of these are in the map. `file_bytes`: its size. `lost_calibration`: it was merged from
     several maps, at least one of which was calibrated, and is not calibrated itself."""
 
@@ -40,30 +40,33 @@ def make_subset(
         return offset_m((south + north) / 2, (west + east) / 2, lat_deg, lon_deg)
 
     ground = area.project_ground(project, margin_m, margin_m)
-    ids_near: dict[Path, list[int]] = {}
+    ids_by_path: dict[Path, list[int]] = {}
     for path in _list_maps(source):
         with PlaceMap.open(path) as place_map:
             place_ids, lat_deg, lon_deg = read_place_positions(place_map)
             if near_ids := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
-                ids_near[path] = near_ids
-    paths, lost_calibration = list(ids_near), False
-    with mapfiles.write_atomically(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
+                ids_by_path[path] = near_ids
+    paths, lost_calibration = list(ids_by_path), False
+    with mapfiles.write_atomically(out) as temp_path, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         all_near, best_near = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
         if len(paths) == 1:
-            near = copy_places(paths[0], all_near, ids_near[paths[0]])
+            near = copy_places(paths[0], all_near, ids_by_path[paths[0]])
         elif paths:
-            counts, lost_calibration = merge_maps(paths, all_near, progress, list(ids_near.values()))
+            counts, lost_calibration = merge_maps(paths, all_near, progress, list(ids_by_path.values()))
             near = sum(copied for copied, _ in counts)
         if not paths or not near:
-            raise UsageError(f"No place of {source} is within {margin_m:g} m of the mission: check both or --margin-m.")
+            raise UsageError(
+                f"No place of {source} is within {margin_m:g} m of the mission: check both, or raise --margin-m."
+            )
         count, file_bytes = near, all_near.stat().st_size
         if max_bytes is not None and file_bytes > max_bytes:
             count = int(near * max_bytes / file_bytes)
             if not count:
-                raise UsageError(f"--mb {max_bytes / 1e6:g} holds no place: each is {file_bytes / near / 1e6:.3f} MB.")
+                place_mb = file_bytes / near / 1e6
+                raise UsageError(f"--mb {max_bytes / 1e6:g} is too small for even one place ({place_mb:.3f} MB each).")
             shrink_map(all_near, best_near, count, progress)
-        shutil.move(best_near if count < near else all_near, unfinished)
-        size = unfinished.stat().st_size
+        shutil.move(best_near if count < near else all_near, temp_path)
+        size = temp_path.stat().st_size
     return Subset(maps=len(paths), near=near, places=count, file_bytes=size, lost_calibration=lost_calibration)
 
 
@@ -72,5 +75,5 @@ def _list_maps(source: Path) -> list[Path]:
     if not source.is_dir():
         return [mapfiles.require_map_file(source)]
     if not (paths := sorted(source.glob("*.gpkg"))):
-        raise MapError(f"{source} contains no map (*.gpkg): give a map, or a folder of maps.")
+        raise MapError(f"{source} contains no map (*.gpkg): pass a map, or a folder of maps.")
     return paths

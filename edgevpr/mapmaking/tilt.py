@@ -1,8 +1,8 @@
 """Measures the tilt of a camera from neighbouring images, before a map is made from them.
 
-Over flat ground all image points of a level camera move equally between images, apart from a rotation and a scale. With
-a tilted camera, near ground moves farther than distant ground: relative to its size, the motion changes across the
-image by tan(tilt) / focal length.
+Over flat ground, all image points of a level camera move equally between images, apart from a rotation and a scale.
+With a tilted camera, near ground moves farther than distant ground: the relative change of the motion across the image
+is tan(tilt) / focal length.
 """
 
 import math
@@ -14,16 +14,16 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image
 
-MAX_UNKNOWN_TILT_DEG = 20.0  # at this tilt the image centre is a third of the height away from the point below
+MAX_UNKNOWN_TILT_DEG = 20.0  # at this tilt the image centre is a third of the height away from the nadir
 TYPICAL_FOV_DEG = 66.0
 MIN_PAIRS = 8
 _WIDTH_PX = 640
 FEATURES = 1500
 _REPROJECTION_PX = 3.0
 _MIN_INLIERS = 40
-_MIN_EXTENT = 0.25  # of the longest side, in both directions: clustered points do not show how motion varies
+_MIN_EXTENT = 0.25  # of the longest side, in both directions; clustered points do not show how motion varies
 _MIN_MOTION = 0.1  # of the longest side
-_MIN_SIGMA = 3.0  # of the median: in single pairs, hills look like more tilt than cameras have
+_MIN_SIGMA = 3.0  # of the median; in single pairs, hills look like more tilt than cameras have
 _MEDIAN_SD = 1.86  # standard deviation of the median of n normal values, in median absolute deviations / sqrt(n)
 
 
@@ -62,8 +62,7 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
 
 
 class Features(NamedTuple):
-    """Features of an image: `points` (n, 2), as offsets from its centre in shares of its longest side, and their
-    descriptors."""
+    """Features of an image: `points` (n, 2), offsets from its centre over its longest side, and their descriptors."""
 
     points: Doubles
     descriptors: np.ndarray
@@ -95,8 +94,8 @@ def match_features(before: Features, after: Features) -> tuple[Doubles, Doubles]
 
 
 class _Motion(NamedTuple):
-    """Motion between two images. `length`: motion at the centre, in shares of the longest side. `slope` (2,): relative
-    change of the motion per longest side, to the right and down, which is tan(tilt) / focal length."""
+    """Motion between two images. `length`: motion at the centre, as a fraction of the longest side. `slope` (2,):
+    relative change of the motion per longest side, to the right and down, which is tan(tilt) / focal length."""
 
     length: float
     slope: Doubles
@@ -114,6 +113,6 @@ def _measure_motion(before: Features, after: Features) -> _Motion | None:
     (motion, *slopes), *_ = np.linalg.lstsq(locations, end - start, rcond=None)
     # The gradient of the motion is the sum of motion times `slope`, a change of scale and a rotation.
     right, down = motion
-    parts = [[right, 0, 1, 0], [0, right, 0, -1], [down, 0, 0, 1], [0, down, 1, 0]]
-    solution, *_ = np.linalg.lstsq(np.array(parts), np.column_stack(slopes).ravel(), rcond=None)
+    equations = [[right, 0, 1, 0], [0, right, 0, -1], [down, 0, 0, 1], [0, down, 1, 0]]
+    solution, *_ = np.linalg.lstsq(np.array(equations), np.column_stack(slopes).ravel(), rcond=None)
     return _Motion(float(np.hypot(*motion)), np.asarray(solution[:2]))

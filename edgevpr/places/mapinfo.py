@@ -148,8 +148,7 @@ def read_identity(place_map: PlaceMap) -> MapIdentity:
 
 def find_inconsistent_tags(shift_m: Floats) -> Bools:
     """Return bool (N,), True for places whose recorded position is more than four standard deviations per axis from the
-    refined one. `shift_m`, float (N,): distances in metres between the two; their median determines the standard
-    deviation."""
+    refined one. `shift_m`, float (N,): metres between the two; their median sets the standard deviation."""
     limit_m = max(_MIN_TAG_ERROR_M, _MAX_SIGMA * float(np.median(shift_m)) / _RAYLEIGH_MEDIAN) if len(shift_m) else 0.0
     is_inconsistent: Bools = shift_m > limit_m
     return is_inconsistent

@@ -54,8 +54,7 @@ class Outputs:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectorRule:
     """How the `boxes` of an object detector are decoded: with the decoder of its `family`. `dynamic` maps the classes
-    of movable objects, such as cars, to their indices in the outputs. Boxes that score below `min_score` are
-    ignored."""
+    of movable objects, such as cars, to their indices in the outputs. Boxes scoring below `min_score` are ignored."""
 
     family: str = key(choices=("yolox", "fastestdet"))
     dynamic: dict[str, int]

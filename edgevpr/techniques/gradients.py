@@ -124,8 +124,8 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     A gradient of magnitude m is in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
     |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g < 0. With v = sqrt(2) m
     sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is summed over the cells
-    once unchanged, and once with the signs of dx, dy or both applied to it. The orientations are sums and differences
-    of these."""
+    once unchanged, and once multiplied by the sign of dx, dy or both. The orientations are sums and differences of
+    these."""
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)

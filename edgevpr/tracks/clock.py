@@ -28,7 +28,7 @@ _MIN_TURNS = 4
 _MIN_TURN_RAD = 0.3
 _MIN_RIVAL_OFFSET_S = 4.0
 _MAX_COST_RATIO = 0.9
-Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as in `mapmaking.graph.Tie`
+Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as in `mapmaking.refine.Tie`
 
 
 def estimate_clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
@@ -62,8 +62,7 @@ def _compute_cost(points: Complexes, indices: Ints, changes: Complexes) -> tuple
 
 
 def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
-    """Interpolate the track at `t_s`: east + i north in metres, complex of the same shape, NaN outside the track and in
-    its gaps."""
+    """Interpolate the track at `t_s`: east + i north in metres, complex of the same shape; NaN outside and in gaps."""
     track_s = np.array(track.t_s)
     lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
     east_m, north_m = project_to_metres(lat_deg, lon_deg)

@@ -51,8 +51,7 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
         return _match_times(record.track, folder, exif_tags, offset_s)
     elif record.shots:
         raise UsageError(
-            f"The camera was triggered {len(record.shots)} times, but {folder} contains {len(exif_tags)} images: keep "
-            "only the triggered ones."
+            f"{len(record.shots)} camera triggers, but {len(exif_tags)} images in {folder}: keep only triggered ones."
         )
     else:
         raise UsageError(f"These positions ({record.kind}) belong to a video: pass that video as --images.")
@@ -104,7 +103,7 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
     start_s, duration_s = read_start_s(video)
     if record.is_utc:
         if start_s is None:
-            raise UsageError(f"{video} has no start time: use a recording with video times.")
+            raise UsageError(f"{video} has no start time: use its subtitles, which have video times.")
         if offset_s is None:
             offset_s = _estimate_zone_offset_s(record.track, np.linspace(start_s, start_s + duration_s, 60), str(video))
         shift_s, how = -start_s - offset_s, "by time"

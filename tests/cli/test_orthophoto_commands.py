@@ -67,7 +67,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
         (
             ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--camera", "forward"],
             2,
-            "give --camera nadir",
+            "pass --camera nadir",
         ),
         (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "nothing.tif does not exist"),
     ],

@@ -10,7 +10,7 @@ import pytest
 from edgevpr.cli.main import main
 from edgevpr.core.arrays import Image
 from edgevpr.frames.mask import load_mask
-from edgevpr.mapmaking.advice import measure_static_share
+from edgevpr.mapmaking.advice import measure_static_fraction
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(3).random((1500, 1500), np.float32), (0, 0), 3)
 GROUND = cv2.normalize(NOISE, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -93,21 +93,21 @@ def drawn_over(number: int) -> Image:
     return image
 
 
-def test_measure_static_share_finds_only_the_overlay():
-    assert measure_static_share(map(bare, range(20)), None) == 0
-    assert 0.006 < measure_static_share(map(drawn_over, range(20)), None) < 0.05
+def test_measure_static_fraction_finds_only_the_overlay():
+    assert measure_static_fraction(map(bare, range(20)), None) == 0
+    assert 0.006 < measure_static_fraction(map(drawn_over, range(20)), None) < 0.05
 
 
-def test_measure_static_share_leaves_out_the_mask(tmp_path):
+def test_measure_static_fraction_leaves_out_the_mask(tmp_path):
     painted = np.full((240, 320), 255, np.uint8)
     painted[:45, :150] = painted[95:145, 135:185] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), painted)
-    assert measure_static_share(map(drawn_over, range(20)), load_mask(str(tmp_path / "mask.png"))) == 0
+    assert measure_static_fraction(map(drawn_over, range(20)), load_mask(str(tmp_path / "mask.png"))) == 0
 
 
 @pytest.mark.parametrize("numbers", [range(11), [3] * 20], ids=["few pictures", "an aircraft that stands"])
-def test_measure_static_share_is_unknown_without_enough_evidence(numbers):
-    assert measure_static_share(map(drawn_over, numbers), None) is None
+def test_measure_static_fraction_is_unknown_without_enough_evidence(numbers):
+    assert measure_static_fraction(map(drawn_over, numbers), None) is None
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ def test_read_area_refuses_an_invalid_mission_in_one_sentence(tmp_path, said):
 
 def test_read_area_refuses_an_empty_or_invalid_area_and_a_foreign_file(tmp_path):
     for empty in ("QGC WPL 110\n", {"fileType": "Plan", "mission": {"items": []}}):
-        with pytest.raises(UsageError, match="no position"):
+        with pytest.raises(UsageError, match="no waypoints"):
             read_area(written(tmp_path, empty))
     with pytest.raises(UsageError, match="invalid coordinates"):
         read_area(written(tmp_path, "QGC WPL 110\n0 1 3 16 0 0 0 0 5542661 707819 0 1"))

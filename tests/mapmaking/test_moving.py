@@ -82,7 +82,7 @@ def test_move_map_corrects_the_scale_around_the_middle_of_the_flight(path, capsy
 def test_move_map_applies_a_log_only_once(path):
     log = log_of(path, FOUND)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
-    with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match="moved since"):
+    with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match="changed or moved"):
         move_map(place_map, log)
 
 

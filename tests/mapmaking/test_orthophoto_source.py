@@ -107,7 +107,7 @@ def test_make_lattice_keeps_places_near_the_path_of_the_area(tmp_path):
         (500, 20, "--footprint-m is 500, but .* 16. m by 16. m"),
         (80, 0, "--spacing-m is 0"),
         (80, 1000, "--spacing-m is 1000"),
-        (80, 0.01, "give --spacing-m 1, or"),
+        (80, 0.01, "pass --spacing-m 1, or"),
     ],
 )
 def test_make_lattice_refuses_an_invalid_grid(tmp_path, footprint_m, spacing_m, said):

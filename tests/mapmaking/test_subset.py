@@ -87,7 +87,7 @@ def test_make_subset_within_a_budget_keeps_the_places_with_the_smallest_gaps(til
     found = make_subset(tiles, area, 1000.0, tmp_path / "f.gpkg", whole.file_bytes / 2, iterate_silently)
     assert (found.near, found.places) == (25, 12)
     assert found.file_bytes < whole.file_bytes
-    with pytest.raises(UsageError, match="holds no place"):
+    with pytest.raises(UsageError, match="too small for even one place"):
         make_subset(tiles, area, 1000.0, tmp_path / "g.gpkg", 100, iterate_silently)
     assert not (tmp_path / "g.gpkg").exists()
 

@@ -80,7 +80,7 @@ def test_evaluate_reports_failed_steps_of_the_map(folder, monkeypatch):
 
     monkeypatch.setattr(finishing, "calibrate_map", lack_scipy)
     result = evaluate(folder, "cohog", COHOG)
-    assert result.not_done == ("the map is not calibrated: SciPy is missing.",)
+    assert result.not_done == ("the map was not calibrated: SciPy is missing.",)
     assert result.not_done[0] in format_results(add_pcu([result]))
     assert evaluate(folder, "hog", HOG).not_done == (), "it has no confidence to calibrate"
 
