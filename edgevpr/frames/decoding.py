@@ -70,16 +70,16 @@ def open_decoder(
     """Open the stream or file `uri` with FFmpeg's `options`. `timeouts_s`: time limits in seconds for opening it and
     for each read (None: no limits). `format_name`: name of its format (None: FFmpeg detects it). `file`: an open file
     to read instead, which the decoder closes. Raises OpeningError with the cause on failure or without video."""
-    with av.logging.Capture() as logged:
+    with av.logging.Capture() as log_lines:
         try:
             container = av.open(file or uri, "r", format=format_name, options=options, timeout=timeouts_s)
         except (av.FFmpegError, OSError, ValueError) as error:
-            messages = [message for _, _, message in logged]
+            messages = [message for _, _, message in log_lines]
             if file:
                 file.close()
             raise _explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
     if container.streams.video and getattr(container.streams.video[0], "codec_context", None):  # None: unknown codec
-        return VideoDecoder(container, _has_loss(logged), file)
+        return VideoDecoder(container, _has_loss(log_lines), file)
     has_video = bool(container.streams.video)
     container.close()
     if file:
@@ -87,8 +87,8 @@ def open_decoder(
     raise OpeningError("the codec is unknown to FFmpeg" if has_video else "no video in the stream")
 
 
-def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
-    return any(_LOSS_WORD in message for _, _, message in logged)
+def _has_loss(log_lines: list[tuple[int, str, str]]) -> bool:
+    return any(_LOSS_WORD in message for _, _, message in log_lines)
 
 
 def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
@@ -164,7 +164,7 @@ class VideoDecoder:
         """Wait for the next packet and return it; None at the end of the file or if the stream is lost. One thread may
         fetch while another decodes."""
         index = self.stream.index
-        with av.logging.Capture() as logged:
+        with av.logging.Capture() as log_lines:
             try:
                 packets = (packet for packet in self._packets if self.is_cancelled or packet.stream.index == index)
                 packet = next(packets, None)
@@ -172,7 +172,7 @@ class VideoDecoder:
                 return None
         if packet is None or self.is_cancelled:
             return None
-        if packet.is_corrupt or _has_loss(logged):
+        if packet.is_corrupt or _has_loss(log_lines):
             # FFmpeg reports a gap while it assembles the image that follows the one it returns.
             self._doubtful_count = _DOUBTFUL_PACKETS
         self._doubtful_count -= 1

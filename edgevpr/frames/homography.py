@@ -28,7 +28,7 @@ class Homography:
     def warp_image(self, image: Image) -> Image:
         shrunk, out_from_pixel = shrink_image(image, self._shrink), self._out_from_pixel
         if shrunk is not image:
-            fy, fx = (before / after for before, after in zip(image.shape[:2], shrunk.shape[:2], strict=True))
+            fy, fx = (full / small for full, small in zip(image.shape[:2], shrunk.shape[:2], strict=True))
             out_from_pixel = out_from_pixel @ [[fx, 0, (fx - 1) / 2], [0, fy, (fy - 1) / 2], [0, 0, 1]]
         # Outside the image, where the mask is False, its edge is replicated, so that no false gradient arises.
         return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype

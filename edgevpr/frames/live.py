@@ -30,8 +30,8 @@ class _Opening:
     """One opening of a camera or stream. `opened_s`: when it succeeded (None: not yet). `cause`: why it could not be
     opened or read further, in a few words (None: lost or cancelled). `thread` runs `read` with this object."""
 
-    def __init__(self, read: Callable[["_Opening"], None], began_s: float) -> None:
-        self.began_s = began_s
+    def __init__(self, read: Callable[["_Opening"], None], start_s: float) -> None:
+        self.start_s = start_s
         self.opened_s: float | None = None
         self.cause: str | None = None
         self.capture: Capture | None = None
@@ -47,10 +47,10 @@ class _Opening:
 
 
 class _Conversion:
-    """The conversion of an image, requested at `began_s`. `image`: result once `done` is set; None if it failed."""
+    """The conversion of an image, requested at `start_s`. `image`: result once `done` is set; None if it failed."""
 
-    def __init__(self, number: int, shot: Shot, began_s: float) -> None:
-        self.number, self.shot, self.began_s = number, shot, began_s
+    def __init__(self, number: int, shot: Shot, start_s: float) -> None:
+        self.number, self.shot, self.start_s = number, shot, start_s
         self.image: Image | None = None
         self.done = threading.Event()
 
@@ -87,7 +87,7 @@ class LiveSource(Source):
         self.stereo = StereoCheck()
         self._open_capture, self._clock = open_capture, clock
         self._t_start_s = clock()
-        self._captured = 0
+        self._capture_count = 0
         self._last_taken_s = float("-inf")
         self._repeats = RepeatDetector()  # kept across openings: a server may begin with a stored image
         self._liveness = Liveness()
@@ -95,7 +95,7 @@ class LiveSource(Source):
         self._conversion: _Conversion | None = None
         self._converter = _Converter()
         self._opening: _Opening | None = None
-        self._hanging: list[threading.Thread] = []  # abandoned because they hang
+        self._hung_threads: list[threading.Thread] = []  # abandoned because they hang
         self._changed = threading.Condition()  # guards all attributes above
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._supervise, name="camera", daemon=True)
@@ -143,11 +143,11 @@ class LiveSource(Source):
         while not self._closing.is_set():
             with self._changed:
                 opening = self._opening = _Opening(self._read_capture, self._clock())
-            captured = self._captured
+            captured = self._capture_count
             fault = self._watch(opening)
             opening.cancel()
-            self._hanging.append(opening.thread)
-            has_failed_again = wait_s and self._captured == captured and fault.condition is not Condition.FROZEN
+            self._hung_threads.append(opening.thread)
+            has_failed_again = wait_s and self._capture_count == captured and fault.condition is not Condition.FROZEN
             wait_s = min(2 * wait_s, _MAX_WAIT_S) if has_failed_again else _FIRST_WAIT_S
             self._liveness.record_reopening(fault)
             self._set_condition(fault.condition, f"{fault.text}, reopening in {wait_s:g} s")
@@ -163,15 +163,15 @@ class LiveSource(Source):
                     self._set_condition(fault.condition, fault.text)
                     if fault.must_reopen:
                         return fault
-        return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else "no picture arrived"), True)
+        return Fault(Condition.LOST, opening.cause or ("lost" if self._capture_count else "no picture arrived"), True)
 
     def _find_fault(self, opening: _Opening) -> Fault | None:
         now_s, conversion = self._clock(), self._conversion
-        if self._captured and now_s - self._last_taken_s > _STALE_PICTURE_S:
+        if self._capture_count and now_s - self._last_taken_s > _STALE_PICTURE_S:
             self.latency_s = now_s - self._last_taken_s
-        if conversion and not conversion.done.is_set() and now_s - conversion.began_s > LOST_AFTER_S:
+        if conversion and not conversion.done.is_set() and now_s - conversion.start_s > LOST_AFTER_S:
             self._converter.requests.put(None)
-            self._hanging.append(self._converter.thread)
+            self._hung_threads.append(self._converter.thread)
             self._converter, self._conversion = _Converter(), None
             self._newest = None  # from the same decoder
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
@@ -179,16 +179,16 @@ class LiveSource(Source):
             return self._liveness.find_fault(now_s)
         return (
             Fault(Condition.LOST, "lost: the opening hangs", True)
-            if now_s - opening.began_s > _OPENING_TIMEOUT_S
+            if now_s - opening.start_s > _OPENING_TIMEOUT_S
             else None
         )
 
     def _wait_for_threads(self, fault: Fault) -> None:
         while not self._closing.is_set():
-            self._hanging = [thread for thread in self._hanging if thread.is_alive()]
-            if len(self._hanging) < _MAX_HANGING_THREADS:
+            self._hung_threads = [thread for thread in self._hung_threads if thread.is_alive()]
+            if len(self._hung_threads) < _MAX_HANGING_THREADS:
                 return
-            self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls to it hang")
+            self._set_condition(fault.condition, f"{fault.text}; {len(self._hung_threads)} calls to it hang")
             self._closing.wait(_FIRST_WAIT_S)
 
     def _read_capture(self, opening: _Opening) -> None:
@@ -236,8 +236,8 @@ class LiveSource(Source):
         self._set_condition(Condition.RUNNING, "streaming")
         self.latency_s, self._last_taken_s = now_s - shot.t_mono_s, shot.t_mono_s
         self.dropped += self._newest is not None
-        self._newest = self._captured, shot
-        self._captured += 1
+        self._newest = self._capture_count, shot
+        self._capture_count += 1
         self._changed.notify_all()
         return None
 

@@ -214,14 +214,14 @@ class Track:
         nearest = int(np.abs(np.subtract(self.t_s, t_s)).argmin())
         if abs(self.t_s[nearest] - t_s) <= _TIME_ROUNDING_S:
             return self.tags[nearest]
-        after = int(np.searchsorted(self.t_s, t_s))
-        if not 0 < after < len(self.t_s) or self.t_s[after] - self.t_s[after - 1] > MAX_GAP_S:
+        upper = int(np.searchsorted(self.t_s, t_s))
+        if not 0 < upper < len(self.t_s) or self.t_s[upper] - self.t_s[upper - 1] > MAX_GAP_S:
             return GeoTag()
-        earlier, later = (np.array(_to_numbers(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
+        earlier, later = (np.array(_to_numbers(tag), float) for tag in self.tags[upper - 1 : upper + 1])  # NaN: unknown
         change = later - earlier
         change[_ANGLE_INDICES] = wrap_deg(change[_ANGLE_INDICES])
-        share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
-        numbers: list[Any] = [None if math.isnan(number) else number for number in (earlier + share * change).tolist()]
+        weight = (t_s - self.t_s[upper - 1]) / (self.t_s[upper] - self.t_s[upper - 1])
+        numbers: list[Any] = [None if math.isnan(number) else number for number in (earlier + weight * change).tolist()]
         lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = numbers
         return GeoTag(
             position=Position(lat_deg, wrap_deg(lon_deg), alt_m),

@@ -36,10 +36,10 @@ class StereoCheck:
         """Return the image, uint8 (H, W[, 3]), unchanged. Raises ImageError if its halves show the same scene."""
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image
-        by_side = {side: correlate_halves(image, side) for side in _HALVES}
-        matching = [side for side, (best, lead) in by_side.items() if best >= _MIN_CORRELATION and lead >= _MIN_LEAD]
-        has_detail = all(best > 0 for best, _ in by_side.values())
-        is_single = has_detail and all(best < _MIN_CORRELATION for best, _ in by_side.values())
+        scores = {side: correlate_halves(image, side) for side in _HALVES}
+        matching = [side for side, (best, lead) in scores.items() if best >= _MIN_CORRELATION and lead >= _MIN_LEAD]
+        has_detail = all(best > 0 for best, _ in scores.values())
+        is_single = has_detail and all(best < _MIN_CORRELATION for best, _ in scores.values())
         self._evidence = min(self._evidence + bool(matching) - is_single, _STEREO_TO_DECIDE)
         self._matching_halves = matching or self._matching_halves
         self._is_stereo = self._evidence == _STEREO_TO_DECIDE or (self._is_stereo and self._evidence > 0)

@@ -71,7 +71,7 @@ class VideoSource(RecordingSource):
         if track and self._expected_s:
             track.require_overlap(path, self._expected_s)
         self._ready: deque[VideoFrame] = deque()
-        self._index, self._damaged = -1, 0
+        self._index, self._damaged_count = -1, 0
         self._t_s = -self._frame_s
         self._t_due_s = self._read_s = 0.0
 
@@ -80,7 +80,7 @@ class VideoSource(RecordingSource):
         while not self.ended:
             if not self._ready:
                 self._decode_more()
-            elif self._damaged:
+            elif self._damaged_count:
                 self._report_damage()
             elif self._advance(picture := self._ready.popleft()):
                 self._t_due_s = self._t_s + self._step_s
@@ -106,7 +106,7 @@ class VideoSource(RecordingSource):
             self._read_s = max(self._read_s, (fetched.packet.pts - self._first_stamp) * self._decoder.unit_s)
         pictures = self._decoder.decode(fetched)
         if isinstance(pictures, Refusal):
-            self._damaged += 1
+            self._damaged_count += 1
         else:
             self._ready.extend(pictures)
 
@@ -119,9 +119,9 @@ class VideoSource(RecordingSource):
         return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S
 
     def _report_damage(self, suffix: str = "") -> None:
-        count, first, t_s = self._damaged, self._index + 1, self._t_s + self._frame_s
+        count, first, t_s = self._damaged_count, self._index + 1, self._t_s + self._frame_s
         self.refused[Refusal.DAMAGED.value] += count
-        self._damaged, self._index = 0, self._index + count
+        self._damaged_count, self._index = 0, self._index + count
         self._t_s += 0.0 if self._decoder.is_stamped else count * self._frame_s
         frames = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
@@ -131,7 +131,7 @@ class VideoSource(RecordingSource):
         )
 
     def _finish(self) -> None:
-        if self._damaged:
+        if self._damaged_count:
             self._report_damage(suffix=" up to the end of the file")
         self.end()
         missing_s = self._expected_s - self._read_s - self._frame_s

@@ -49,18 +49,18 @@ def lacks_heading(frame: Frame, lens: Lens) -> bool:
 
 
 def _measure_heading(
-    before: Frame, start: Features, after: Frame, end: Features, lens: Lens
+    first: Frame, start: Features, second: Frame, end: Features, lens: Lens
 ) -> tuple[float, float] | None:
-    """Return the heading of the frame `after`, and the rotation from `before` to `after`, in degrees; None if the two
+    """Return the heading of the frame `second`, and the rotation from `first` to `second`, in degrees; None if the two
     were taken too close together or share too little ground."""
-    if before.position is None or after.position is None:
+    if first.position is None or second.position is None:
         return None
-    start_deg, end_deg = ((position.lat_deg, position.lon_deg) for position in (before.position, after.position))
+    start_deg, end_deg = ((position.lat_deg, position.lon_deg) for position in (first.position, second.position))
     east_m, north_m = offset_m(*start_deg, *end_deg)
     pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _MIN_STEP_M else None
     if pairs is None:
         return None
-    src, dst = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
+    src, dst = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (first, second), strict=True))
     turn_scale, shift = fit_similarity(src, dst)
     if not 1 / _MAX_SCALE < abs(turn_scale) < _MAX_SCALE:
         return None

@@ -124,7 +124,7 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
             raise
         if ground := measure_ground(place_map):
             _log.info("%s", ground.describe(is_flown=isinstance(pictures, FlightPictures)))
-        finished = finish_map(
+        finishing_result = finish_map(
             place_map, encoder, config.match, pictures, progress, refine=plan.refine, calibrate=plan.calibrate
         )
         info = describe_map(place_map)
@@ -136,9 +136,9 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
             with_position=info.with_position,
             result=replace(result, **counts),
             covered=ground,
-            refined=finished.refined,
-            calibration=finished.calibration,
-            not_done=finished.not_done,
+            refined=finishing_result.refined,
+            calibration=finishing_result.calibration,
+            not_done=finishing_result.not_done,
         )
 
 

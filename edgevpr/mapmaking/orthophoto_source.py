@@ -77,7 +77,7 @@ class OrthophotoSource(RecordingSource):
         self.total = sum(map(len, lattices))
         self.short_name = decode_name(orthophoto.short_name)
         self.counts = {"without_data": 0, "white": 0}
-        self._read = 0
+        self._read_count = 0
         self._remaining = ((lattice, index) for lattice in lattices for index in range(len(lattice)))
         variance_m2 = _GEOREFERENCE_SD_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._covariance_m2 = variance_m2, 0.0, variance_m2
@@ -88,8 +88,8 @@ class OrthophotoSource(RecordingSource):
         if self.ended:
             return None
         lattice, index = next(self._remaining)
-        self._read += 1
-        if self._read == self.total:
+        self._read_count += 1
+        if self._read_count == self.total:
             self.end()
         grid_indices = zip((lattice.rows[index], lattice.columns[index]), lattice.shape, strict=True)
         # Leading zeros make the names sort in grid order.

@@ -127,24 +127,24 @@ def refine(
     compare_pair = _make_comparer(place_map, technique, refinable, images)
     pairs = _find_likely_pairs(recorded)
     ties = {pair: tie for pair in progress(pairs, len(pairs), "refining") if (tie := compare_pair(*pair))}
-    solved = solve_graph(recorded, _to_ties(ties))
-    new_pairs = sorted(set(_find_overlapping_pairs(solved.position, solved.log, _is_determined(solved))) - set(pairs))
-    if new_pairs:
-        ties |= {pair: tie for pair in progress(new_pairs, len(new_pairs), "refining") if (tie := compare_pair(*pair))}
-        solved = solve_graph(recorded, _to_ties(ties))
-    is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solved)
-    refined = _is_determined(solved) & (not is_mirrored)
-    _write_poses(place_map, refinable, positions, solved, refined)
-    moved_m = abs(solved.position - recorded)[refined]
+    solution = solve_graph(recorded, _to_ties(ties))
+    extra = sorted(set(_find_overlapping_pairs(solution.position, solution.log, _is_determined(solution))) - set(pairs))
+    if extra:
+        ties |= {pair: tie for pair in progress(extra, len(extra), "refining") if (tie := compare_pair(*pair))}
+        solution = solve_graph(recorded, _to_ties(ties))
+    is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solution)
+    refined = _is_determined(solution) & (not is_mirrored)
+    _write_poses(place_map, refinable, positions, solution, refined)
+    moved_m = abs(solution.position - recorded)[refined]
     members = np.flatnonzero(refined)
     return replace(
         result,
         refined=int(refined.sum()),
-        ties=int(solved.ties_agree.sum()),
-        recorded_sd_m=solved.recorded_sd_m,
+        ties=int(solution.ties_agree.sum()),
+        recorded_sd_m=solution.recorded_sd_m,
         moved_m=_find_median(moved_m),
-        position_sd_m=_find_median(np.sqrt(solved.position_var[refined] / 2)),
-        footprint_m=_find_median(np.exp(solved.log.real[refined])),
+        position_sd_m=_find_median(np.sqrt(solution.position_var[refined] / 2)),
+        footprint_m=_find_median(np.exp(solution.log.real[refined])),
         contradictory=tuple(
             (refinable[members[row]].place_id, refinable[members[row]].source_image, float(moved_m[row]))
             for row in np.flatnonzero(find_inconsistent_tags(moved_m))
@@ -160,18 +160,18 @@ def _get_recorded_position(place: Place) -> Position:
     return position
 
 
-def _is_determined(solved: GraphSolution) -> Bools:
+def _is_determined(solution: GraphSolution) -> Bools:
     """Return bool (N,), True for places in a large enough group whose solution is accurate enough for a pose."""
-    group_size = np.bincount(solved.component)[solved.component]
-    is_determined: Bools = (group_size >= _MIN_GROUP) & (solved.log_var / 2 <= _MAX_LOG_SD**2)
+    group_size = np.bincount(solution.component)[solution.component]
+    is_determined: Bools = (group_size >= _MIN_GROUP) & (solution.log_var / 2 <= _MAX_LOG_SD**2)
     return is_determined
 
 
-def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, solved: GraphSolution) -> bool:
+def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, solution: GraphSolution) -> bool:
     """Return True if the ties fit a mirror image of the recorded positions much better than the positions themselves,
     as when lat and lon are exchanged or a sign is wrong. Places on a straight line or in small groups hide it."""
     sample = slice(_MAX_MIRROR_PLACES)
-    misfit = _compute_misfit(recorded, solved, sample)
+    misfit = _compute_misfit(recorded, solution, sample)
     if misfit < _MIN_MISFIT:
         return False
     in_sample = (ties.query < _MAX_MIRROR_PLACES) & (ties.place < _MAX_MIRROR_PLACES)
@@ -185,16 +185,16 @@ def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, sol
     return any(_compute_misfit(image, solve_graph(image, sample_ties), sample) < limit for image in mirrored)
 
 
-def _compute_misfit(recorded: Complexes, solved: GraphSolution, sample: slice) -> float:
+def _compute_misfit(recorded: Complexes, solution: GraphSolution, sample: slice) -> float:
     """Return the median distance between recorded and solved positions in `sample`, divided by the spread of the
     recorded ones. Only large enough groups of places connected by ties are used; 0 if there is none."""
-    component, position = solved.component[sample], recorded[sample]
+    component, position = solution.component[sample], recorded[sample]
     size = np.bincount(component)
     is_used = size[component] >= _MIN_GROUP
     if not is_used.any():
         return 0.0
     mean = (np.bincount(component, position.real) + 1j * np.bincount(component, position.imag)) / np.maximum(size, 1)
-    error_m, spread_m = abs(solved.position[sample] - position)[is_used], abs(position - mean[component])[is_used]
+    error_m, spread_m = abs(solution.position[sample] - position)[is_used], abs(position - mean[component])[is_used]
     return float(np.median(error_m) / max(np.median(spread_m), 1e-9))
 
 
@@ -205,7 +205,7 @@ def _read_places(place_map: PlaceMap) -> Iterator[Place]:
 
 
 def _write_poses(
-    place_map: PlaceMap, refinable: list[Place], positions: list[Position], solved: GraphSolution, refined: Bools
+    place_map: PlaceMap, refinable: list[Place], positions: list[Position], solution: GraphSolution, refined: Bools
 ) -> None:
     """Write the solved positions and poses to the map for places where `refined`, bool (N,), is True. The others are
     reset to their recorded positions, without a pose."""
@@ -214,11 +214,11 @@ def _write_poses(
         for index, place in enumerate(refinable):
             position, pose = positions[index], None
             if refined[index]:
-                var_m2, offset_m = float(solved.position_var[index]) / 2, solved.position[index]
+                var_m2, offset_m = float(solution.position_var[index]) / 2, solution.position[index]
                 position = move_position(origin, offset_m.real, offset_m.imag)
                 pose = Pose(
-                    up_deg=float(-np.degrees(solved.log[index].imag)) % 360,
-                    footprint_m=float(np.exp(solved.log[index].real)),
+                    up_deg=float(-np.degrees(solution.log[index].imag)) % 360,
+                    footprint_m=float(np.exp(solution.log[index].real)),
                     covariance_m2=(var_m2, 0.0, var_m2),
                     recorded=positions[index],
                 )

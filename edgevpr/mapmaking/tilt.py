@@ -79,13 +79,13 @@ def detect_features(orb: cv2.ORB, image: Image) -> Features | None:
     return Features((np.array([keypoint.pt for keypoint in keypoints]) - middle) / max(small.shape), descriptors)
 
 
-def match_features(before: Features, after: Features) -> tuple[Doubles, Doubles] | None:
+def match_features(first: Features, second: Features) -> tuple[Doubles, Doubles] | None:
     """Return the matched points (n, 2) of two images, each as in `Features`; None if there are too few."""
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(before.descriptors, after.descriptors)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(first.descriptors, second.descriptors)
     if len(matches) < _MIN_INLIERS:
         return None
-    start = before.points[[match.queryIdx for match in matches]]
-    end = after.points[[match.trainIdx for match in matches]]
+    start = first.points[[match.queryIdx for match in matches]]
+    end = second.points[[match.trainIdx for match in matches]]
     homography, inliers = cv2.findHomography(start, end, cv2.RANSAC, _REPROJECTION_PX / _WIDTH_PX)
     if homography is None or inliers.sum() < _MIN_INLIERS:
         return None
@@ -101,9 +101,9 @@ class _Motion(NamedTuple):
     slope: Doubles
 
 
-def _measure_motion(before: Features, after: Features) -> _Motion | None:
+def _measure_motion(first: Features, second: Features) -> _Motion | None:
     """Return the motion between two images; None if they share too little ground."""
-    pairs = match_features(before, after)
+    pairs = match_features(first, second)
     if pairs is None:
         return None
     start, end = pairs

@@ -70,7 +70,7 @@ class Board:
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:
         """Return True if this is the profile of the machine that edgevpr runs on."""
-        return self.name == _detect_board(root).name or _is_model_of(self, root)
+        return self.name == _detect_board(root).name or _has_model(self, root)
 
 
 def list_boards() -> tuple[str, ...]:
@@ -97,7 +97,7 @@ def resolve_board(board: Board, source: SourceConfig, memory: MemoryConfig) -> B
     return replace(board, rate_hz=source.rate_hz or board.rate_hz, budget_mb=memory.budget_mb or board.budget_mb)
 
 
-def _is_model_of(board: Board, root: Path) -> bool:
+def _has_model(board: Board, root: Path) -> bool:
     """Return True if the model name of the machine at `root` contains the text `board.recognised_by`."""
     model = machine.read_model(root)
     return bool(model and board.recognised_by and board.recognised_by.lower() in model.lower())
@@ -125,7 +125,7 @@ def _detect_board(root: Path) -> Board:
     """Return the profile of this machine's board, or else generic-x86, with the cores and memory of this machine."""
     model = machine.read_model(root)
     detected = next(
-        (board for board in map(_read_shipped_board, list_boards() if model else ()) if _is_model_of(board, root)), None
+        (board for board in map(_read_shipped_board, list_boards() if model else ()) if _has_model(board, root)), None
     )
     profile = detected or _read_shipped_board(_FALLBACK_BOARD)
     title = profile.title

@@ -156,7 +156,7 @@ class ProcessLoad:
 
     def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock
-        self._busy_s = self._ran_s = 0.0
+        self._work_s = self._work_cpu_s = 0.0
         self._measured_s, self._cpu_s = clock(), cpu_clock()
 
     @property
@@ -167,16 +167,16 @@ class ProcessLoad:
     def add_work(self, work: StageCost) -> None:
         """Add a piece of work. Its `cpu_s` is the CPU time of the one thread (`time.thread_time`) that did it or waited
         for it."""
-        self._busy_s += work.wall_s
-        self._ran_s += work.cpu_s
+        self._work_s += work.wall_s
+        self._work_cpu_s += work.cpu_s
 
     def measure(self) -> tuple[float, float]:
         """Return two fractions since the last call, 0..1: that of all cores that this process used, and that of the
         time taken by the added work if other programs delayed it, else 0."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._measured_s, cpu_s - self._cpu_s)
-        was_delayed = self._ran_s < (1 - _MIN_WAIT_FRACTION) * self._busy_s
-        late_share = min(1.0, self._busy_s / span.wall_s) if was_delayed and span.wall_s > 0 else 0.0
+        was_delayed = self._work_cpu_s < (1 - _MIN_WAIT_FRACTION) * self._work_s
+        late_share = min(1.0, self._work_s / span.wall_s) if was_delayed and span.wall_s > 0 else 0.0
         self._measured_s, self._cpu_s = now_s, cpu_s
-        self._busy_s = self._ran_s = 0.0
+        self._work_s = self._work_cpu_s = 0.0
         return span.utilisation(self._cores), late_share

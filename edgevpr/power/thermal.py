@@ -52,7 +52,7 @@ class ThermalWatch:
             name.parent for name in (root / "sys/class/hwmon").glob("*/name") if machine.read_text(name) == "rpi_volt"
         )
         self._alarm = next((folder / "in0_lcrit_alarm" for folder in volts), None)
-        self._bits_before: int | None = None
+        self._previous_bits: int | None = None
 
     def read(self) -> ThermalState:
         """Read the sensors. Never raises: a value that cannot be read, or is impossible, becomes None."""
@@ -79,8 +79,8 @@ class ThermalWatch:
         alarm = _read_number(self._alarm) if self._alarm else None
         if bits is None:
             return None if alarm is None else alarm > 0
-        previous_bits = bits if self._bits_before is None else self._bits_before
-        self._bits_before = bits
+        previous_bits = bits if self._previous_bits is None else self._previous_bits
+        self._previous_bits = bits
         return bool((alarm or 0) > 0 or bits & _UNDER_VOLTAGE_BIT or (bits & ~previous_bits) >> 16 & _UNDER_VOLTAGE_BIT)
 
     def _find_slowdown_signs(

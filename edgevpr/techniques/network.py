@@ -98,11 +98,11 @@ def netvlad(
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)
-    learned, sha256 = load_words(model, "vlad", words)
-    sharpness = compute_sharpness(learned) if assignment == "soft" else None
+    vocabulary, sha256 = load_words(model, "vlad", words)
+    sharpness = compute_sharpness(vocabulary) if assignment == "soft" else None
 
     def head(features: Singles) -> Singles:
-        return compute_vlad(make_local_descriptors(features), learned, sharpness)
+        return compute_vlad(make_local_descriptors(features), vocabulary, sharpness)
 
     parameters = {"model": model, "words": words, "assignment": assignment}
     return NetworkVector("netvlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)
@@ -117,10 +117,10 @@ def region_vlad(
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
     Appearance Changes", T-RO 2019, as in thesis 4.2.1: 400 regions of `conv4`, 256 words."""
     backbone = open_region_backbone("region_vlad", model, threads, regions)
-    learned, sha256 = load_words(model, "regions", words)
+    vocabulary, sha256 = load_words(model, "regions", words)
 
     def head(features: Singles) -> Singles:
-        return compute_vlad(describe_regions(features, find_regions(features, regions)), learned)
+        return compute_vlad(describe_regions(features, find_regions(features, regions)), vocabulary)
 
     parameters = {"model": model, "regions": regions, "words": words}
     return NetworkVector("region_vlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)

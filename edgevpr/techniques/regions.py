@@ -88,13 +88,13 @@ def cross_region_bow(
     IROS 2017, as in thesis 4.2.1, but with one feature map: the paper finds regions in `conv5_3` of VGG-16 and
     describes them from `conv5_2`."""
     backbone = open_region_backbone("cross_region_bow", model, threads, regions)
-    learned, sha256 = load_words(model, "bow", words)
+    vocabulary, sha256 = load_words(model, "bow", words)
 
     def describe_picture(features: Singles) -> tuple[Singles, Singles]:
         vectors = describe_regions(features, find_regions(features, regions))
         padded = np.zeros((regions, len(features)), np.float32)
         padded[: len(vectors)] = vectors
-        return compute_bag_of_words(vectors, learned), padded
+        return compute_bag_of_words(vectors, vocabulary), padded
 
     # With the shipped weights every wrong match had a margin below 0.056 in every form (see `network`).
     parameters = {"model": model, "regions": regions, "words": words}

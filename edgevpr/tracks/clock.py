@@ -66,8 +66,8 @@ def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
     track_s = np.array(track.t_s)
     lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
     east_m, north_m = project_to_metres(lat_deg, lon_deg)
-    after = np.clip(np.searchsorted(track_s, t_s), 1, max(len(track_s) - 1, 1))
-    is_known = (t_s >= track_s[0]) & (t_s <= track_s[-1]) & (track_s[after] - track_s[after - 1] <= MAX_GAP_S)
+    upper = np.clip(np.searchsorted(track_s, t_s), 1, max(len(track_s) - 1, 1))
+    is_known = (t_s >= track_s[0]) & (t_s <= track_s[-1]) & (track_s[upper] - track_s[upper - 1] <= MAX_GAP_S)
     return np.where(is_known, np.interp(t_s, track_s, east_m + 1j * north_m), np.nan)
 
 
@@ -76,9 +76,9 @@ def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     complex factor by which the motion changes."""
     moves = [_measure_move(first, second) for first, second in pairwise(_describe_landmarks(paths))]
     changes = {
-        index: np.log(after[0] / before[0]) + before[1]
-        for index, (before, after) in enumerate(pairwise(moves))
-        if before and after and before[0] and after[0]
+        index: np.log(second[0] / first[0]) + first[1]
+        for index, (first, second) in enumerate(pairwise(moves))
+        if first and second and first[0] and second[0]
     }
     return np.array(list(changes), int), np.array(list(changes.values()), complex)
 
