@@ -316,7 +316,7 @@ LIVE = ("udp://:5600", "udp://@239.0.0.1:5600", "rtsp://user:secret@host/path", 
 @pytest.mark.parametrize(
     ("uri", "live", "complaint"),
     [
-        ("missing.mp4", True, "There is nothing at `missing.mp4`: give a folder of images, a video file, a camera"),
+        ("missing.mp4", True, "There is nothing at `missing.mp4`: choose a folder of images, a video file, a camera"),
         *((uri, True, f"{uri} is not the address") for uri in ("rtmp://h/live", "rtsp:///a", "udp://h", "tcp://h:a")),
         *((uri, False, "live") for uri in LIVE),  # where the work has an end
     ],
