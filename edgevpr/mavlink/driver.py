@@ -98,7 +98,7 @@ class PortDriver:
                 if self._writer is None:
                     self._reopen()
                 else:
-                    self._work(self._writer, timeout_s=MAX_SLEEP_S)
+                    self._exchange_data(self._writer, timeout_s=MAX_SLEEP_S)
             except (OSError, LinkError) as error:
                 self._handle_loss(error)
             except Exception as error:  # reopen the link instead of losing it
@@ -115,7 +115,7 @@ class PortDriver:
             self._conversation.drop_stale()
         self._writer = self._open()
 
-    def _work(self, writer: PacketWriter, timeout_s: float) -> None:
+    def _exchange_data(self, writer: PacketWriter, timeout_s: float) -> None:
         """Write as much as the port accepts, wait up to `timeout_s` for data or a wake-up, then read."""
         with self._turns.take_link_turn():
             if writer.port.connected:
@@ -184,7 +184,7 @@ class PortDriver:
         deadline_s = time.monotonic() + FLUSH_TIMEOUT_S
         with suppress(OSError):
             while self._writer and self._writer.port.connected and time.monotonic() < deadline_s:
-                self._work(self._writer, timeout_s=0.01)
+                self._exchange_data(self._writer, timeout_s=0.01)
                 if not self._conversation.has_pending and self._writer.is_idle:
                     break
 

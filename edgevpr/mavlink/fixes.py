@@ -152,7 +152,7 @@ class Fixes:
             # Late answers may arrive now, and must not be matched to a new fix.
             self._resumes_s = now_s + ANSWER_TIMEOUT_S
         self._consecutive_unanswered = 0
-        self.time_out(now_s)
+        self.expire_unanswered(now_s)
         is_accepted = result == "ACCEPTED"
         if (result, reason) != self._last_answer:
             level = logging.INFO if is_accepted else logging.WARNING
@@ -172,7 +172,7 @@ class Fixes:
         transmission.outcome = FixAnswer(result, None if is_accepted else reason, now_s - sent_s)
         return transmission
 
-    def time_out(self, now_s: float) -> None:
+    def expire_unanswered(self, now_s: float) -> None:
         """Count the fixes sent more than a second ago as unanswered."""
         while self._awaited and self._awaited[0][1].sent and now_s - self._awaited[0][0] > ANSWER_TIMEOUT_S:
             self._give_up(Reason(ReasonCode.NO_ANSWER, {"limit_s": ANSWER_TIMEOUT_S}))
@@ -184,7 +184,7 @@ class Fixes:
 
     def report_silence(self, why_silent: Reason, now_s: float) -> None:
         """Report when fixes are no longer answered (with the likely reason `why_silent`), or are answered again."""
-        self.time_out(now_s)
+        self.expire_unanswered(now_s)
         is_stopped = self._consecutive_unanswered >= MAX_UNANSWERED
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWER_TIMEOUT_S):
             return

@@ -90,7 +90,7 @@ class Heights:
         self._last = altitudes
         self._check_range(altitudes.t_s)
 
-    def now(self, now_s: float) -> float:
+    def compute_height_m(self, now_s: float) -> float:
         """Return the height above the ground in metres from the best recent source."""
         measured_m = self._get_recent(self._range, now_s, RANGE_MAX_AGE_S)
         return self._compute_autopilot_height_m(now_s) if measured_m is None else measured_m

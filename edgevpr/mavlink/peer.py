@@ -297,9 +297,9 @@ class Autopilot:
             t_received_s=now_s,
             has_gps=has_gps,
             gps=gps,
-            height_m=self.heights.now(now_s),
+            height_m=self.heights.compute_height_m(now_s),
             height_doubt_m=self.heights.doubt_m,
-            position_sd_m=self.accuracy.now(now_s),
+            position_sd_m=self.accuracy.compute_sd_m(now_s),
             innovation_ratio=self.accuracy.innovation_ratio(now_s),
         )
         self._listener.handle_vehicle(self.vehicle)

@@ -95,7 +95,7 @@ class PositionAccuracy:
         """Record the accuracy of the position at `now_s`, from GPS or from a fix that was accepted."""
         self._last_known = sd_m, now_s
 
-    def now(self, now_s: float) -> float | None:
+    def compute_sd_m(self, now_s: float) -> float | None:
         """Return the standard deviation in metres; None if it is unknown, or the autopilot has no position."""
         if self._reported and now_s - self._reported[1] <= MAX_FILTER_REPORT_AGE_S:
             return self._reported[0]

@@ -80,7 +80,7 @@ def test_fixes_may_affect_the_position_unless_refused(fixes):
     hear(fixes, "DENIED", 12.1)
     assert fixes.t_fix_s == 11.1
     sent(fixes, 13.0)
-    fixes.time_out(14.1)
+    fixes.expire_unanswered(14.1)
     assert fixes.t_fix_s == 13.0, "only the answer may have been lost"
     sent(fixes, 15.0)
     fixes.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))

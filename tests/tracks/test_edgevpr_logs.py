@@ -35,7 +35,7 @@ def fly(tmp_path, is_live=True):
         log.write("start", recording=str(recording.path))
         recording.note("is_live", is_live)
         for number, vehicle in enumerate(vehicles()):
-            recording.note("frame", {"name": f"frame {number}", "number": recording.keep(jpeg)})
+            recording.note("frame", {"name": f"frame {number}", "number": recording.store_frame(jpeg)})
             log.write("query", query=f"frame {number}", t_frame_s=FRAME_S, vehicle=vehicle)
     return tmp_path / "flight.jsonl", recording.path / "frames"
 

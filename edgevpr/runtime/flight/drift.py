@@ -220,7 +220,7 @@ class DriftFilter:
         of the prediction, excluding that of the fix itself."""
         return _FIX @ self._x, _FIX @ self._p @ _FIX.T
 
-    def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
+    def estimate_errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
         """Return the errors of the path `age_s` seconds ago (negative: in the future):
         - offset (2,) from the path to the aircraft, metres
         - velocity error (2,), m/s

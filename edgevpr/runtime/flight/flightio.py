@@ -147,7 +147,7 @@ def record_io(io: FlightIO, recording: Recording) -> FlightIO:
         io,
         clock=tape_clock(io.clock, recording),
         machine=tape_machine(io.machine, recording),
-        open_source=lambda step_s: RecordedSource(io.open_source(step_s), recording, recording.keep),
+        open_source=lambda step_s: RecordedSource(io.open_source(step_s), recording, recording.store_frame),
         turns=turns,
         drive=partial(RecordedDriver, turns),
         stop=TapedStop(recording),

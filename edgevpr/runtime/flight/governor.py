@@ -194,7 +194,7 @@ class GovernorActuator:
         parts = self._parts
         if parts.meter.load.age_s < GOVERN_INTERVAL_S:
             return
-        change = self.governor.update(parts.io.clock.mono_s(), parts.meter.reading())
+        change = self.governor.update(parts.io.clock.mono_s(), parts.meter.read_load())
         if change is None:
             return
         text = gcs_text = self.governor.restriction or "back to the configured settings"

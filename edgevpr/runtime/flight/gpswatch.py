@@ -10,7 +10,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.receivers import extrapolate
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
-from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps, worst_sd
+from edgevpr.runtime.flight.measurements import PositionedMatch, compute_worst_sd, measure_for_gps
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -70,7 +70,7 @@ class GpsWatch:
         gps_deg = extrapolate(vehicle.gps, match.t_s, vehicle.velocity_m_s or (0.0, 0.0))
         error_m = np.array(offset_m(*gps_deg, match.position.lat_deg, match.position.lon_deg))
         was_wrong, tilt_error_m = self.is_wrong, (vehicle.height_m or 0.0) * _compute_attitude_error(match)
-        sd_m = math.hypot(worst_sd(match.covariance_m2), vehicle.gps.sd_m, match.frame.sd_m, tilt_error_m)
+        sd_m = math.hypot(compute_worst_sd(match.covariance_m2), vehicle.gps.sd_m, match.frame.sd_m, tilt_error_m)
         self._judge(match, error_m, sd_m)
         distance_m = math.hypot(*error_m)
         if self._autopilot:

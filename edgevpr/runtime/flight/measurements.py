@@ -95,7 +95,7 @@ def measure_frame(
         height_m, has_attitude = height_ratio * (vehicle.height_m or 0.0), vehicle.roll_deg is not None
         sweep_m_s = height_m * math.radians(0.0 if is_level else vehicle.tilt_rate_deg_s)
         attitude_sd = ATTITUDE_SD if has_attitude else _UNKNOWN_ATTITUDE_SD
-        sd_m = picture_error_m(vehicle, height_m, event.frame.t_sd_s, attitude_sd, sweep_m_s)
+        sd_m = compute_picture_error_m(vehicle, height_m, event.frame.t_sd_s, attitude_sd, sweep_m_s)
     is_unaffected = is_level or not has_attitude or not (event.view.nadir_offset or event.view.nadir_offset_m)
     can_scale = 1 / _MAX_HEIGHT_RATIO < height_ratio < _MAX_HEIGHT_RATIO
     return FrameMeasurement(
@@ -113,11 +113,11 @@ def measure_for_gps(event: Recognition, vehicle: Vehicle) -> PositionedMatch | N
     if event.frame is None:
         return None
     t_sd_s = math.hypot(RECEIVER_LAG_SD_S, event.frame.t_sd_s)
-    sd_m = picture_error_m(vehicle, vehicle.height_m or 0.0, t_sd_s, REPORTED_TILT_SD)
+    sd_m = compute_picture_error_m(vehicle, vehicle.height_m or 0.0, t_sd_s, REPORTED_TILT_SD)
     return position_match(event, FrameMeasurement(t_s=event.frame.t_mono_s, sd_m=sd_m))
 
 
-def picture_error_m(
+def compute_picture_error_m(
     vehicle: Vehicle, height_m: float, t_sd_s: float, attitude_sd: float = ATTITUDE_SD, sweep_m_s: float = 0.0
 ) -> float:
     """Return the standard deviation (metres, of one axis) of a position from a picture. `t_sd_s` is that of its time,
@@ -127,13 +127,14 @@ def picture_error_m(
 
 
 def add_frame_error(match_m: float, event: Recognition, vehicle: Vehicle, height_m: float, attitude_sd: float) -> float:
-    """Return the accuracy (metres) to report for the match of an event: `match_m`, of match and map, and the errors of
-    the attitude (a tangent; no effect at a `height_m` of 0) and the time of its frame."""
+    """Return the accuracy (metres) to report for the match of an event: that of match and map (`match_m`) combined with
+    the errors of the attitude (`attitude_sd`, a tangent; no effect at `height_m` 0) and of the frame's time."""
     t_sd_s, sweep_m_s = event.frame.t_sd_s if event.frame else 0.0, height_m * math.radians(vehicle.tilt_rate_deg_s)
-    return math.hypot(match_m, picture_error_m(vehicle, height_m, t_sd_s, max(ATTITUDE_SD, attitude_sd), sweep_m_s))
+    attitude_sd = max(ATTITUDE_SD, attitude_sd)
+    return math.hypot(match_m, compute_picture_error_m(vehicle, height_m, t_sd_s, attitude_sd, sweep_m_s))
 
 
-def shared_time_error_m(event: Recognition, vehicle: Vehicle | None) -> float:
+def compute_time_error_m(event: Recognition, vehicle: Vehicle | None) -> float:
     """Return the standard deviation (metres) of the position error common to frames if their times are less accurate
     than usual. It is always along the flight, so averaging over frames does not reduce it."""
     t_sd_s = event.frame.t_sd_s if event.frame else 0.0
@@ -160,6 +161,6 @@ def position_match(event: Recognition, frame: FrameMeasurement) -> PositionedMat
     )
 
 
-def worst_sd(covariance: Doubles) -> float:
+def compute_worst_sd(covariance: Doubles) -> float:
     """Return the standard deviation along the worst direction of a covariance (2, 2)."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

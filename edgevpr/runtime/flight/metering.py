@@ -54,15 +54,15 @@ class FlightMeter:
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
             "elapsed_s": process.wall_s,
-            "used_mah": self._mah(board.idle_w * process.wall_s + process_j),
-            "marginal_mah": self._mah(self.energy.marginal_j),
+            "used_mah": self._to_mah(board.idle_w * process.wall_s + process_j),
+            "marginal_mah": self._to_mah(self.energy.marginal_j),
         }
 
     def measure_heat(self) -> None:
         """Measure the temperature and supply of the board. Call it about once a second."""
         self.thermal = self._machine.measure_heat()
 
-    def reading(self) -> LoadReading:
+    def read_load(self) -> LoadReading:
         """Return a measurement for the governor: load since the last one, and current memory and temperature."""
         cpu_share, late_share = self.load.measure()
         return LoadReading(
@@ -73,5 +73,5 @@ class FlightMeter:
             throttled=self.thermal.throttled,
         )
 
-    def _mah(self, energy_j: float) -> float:
+    def _to_mah(self, energy_j: float) -> float:
         return 1000 * pack_ah(energy_j, self._pack, self._regulator_efficiency)

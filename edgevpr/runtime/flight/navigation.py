@@ -11,7 +11,7 @@ from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
-from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, worst_sd
+from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, compute_worst_sd
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import mahalanobis
@@ -148,7 +148,7 @@ class Navigation:
                 self._filter.lose_gps()
             return
         offset_m, sd_m, error_m_s, sd_m_s, age_s = error
-        predicted_m, _, covariance = self._filter.errors(age_s)
+        predicted_m, _, covariance = self._filter.estimate_errors(age_s)
         if mahalanobis(offset_m - predicted_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _MAX_RECEIVER_SIGMA:
             self._handle_contradiction(receiver, vehicle.t_received_s)
             return
@@ -247,7 +247,7 @@ class Navigation:
         """Correct our position by a fix that `Consistency` has accepted with this verdict."""
         match = fix.match
         if self._path and verdict.restarts_path and self._drift.is_inertial:
-            self.start_at_fix(match.position, worst_sd(match.scatter_m2), match.t_s, self._path.now.t_s)
+            self.start_at_fix(match.position, compute_worst_sd(match.scatter_m2), match.t_s, self._path.now.t_s)
         elif self._path:
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
@@ -281,20 +281,20 @@ class Navigation:
         point = path.interpolate(t_s) if path else None
         if path is None or point is None:
             return None
-        error_m, error_m_s, covariance = self._filter.errors(path.now.t_s - t_s)
+        error_m, error_m_s, covariance = self._filter.estimate_errors(path.now.t_s - t_s)
         position_m = point.position_m + error_m
         velocity_m_s = point.velocity_m_s + error_m_s
         return NavState(
             t_s=t_s,
             position=Position(*offset_position(path.origin.lat_deg, path.origin.lon_deg, *position_m.tolist())),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
-            accuracy_m=math.hypot(worst_sd(covariance[:2, :2]), self._odometry_since_fix.error_m),
-            speed_accuracy_m_s=worst_sd(covariance[2:, 2:]),
+            accuracy_m=math.hypot(compute_worst_sd(covariance[:2, :2]), self._odometry_since_fix.error_m),
+            speed_accuracy_m_s=compute_worst_sd(covariance[2:, 2:]),
         )
 
     def path_drift_m_s(self) -> tuple[float, float]:
         """Return the velocity (east, north) of the aircraft minus that of its path."""
-        _, error_m_s, _ = self._filter.errors(0.0)
+        _, error_m_s, _ = self._filter.estimate_errors(0.0)
         return float(error_m_s[0]), float(error_m_s[1])
 
     def _start(

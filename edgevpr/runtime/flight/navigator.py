@@ -21,10 +21,10 @@ from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL,
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
     add_frame_error,
+    compute_time_error_m,
+    compute_worst_sd,
     measure_frame,
     position_match,
-    shared_time_error_m,
-    worst_sd,
 )
 from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
 from edgevpr.runtime.flight.output import INFLUENCE_S, Output, OutputWatch
@@ -170,7 +170,7 @@ class Navigator(Listener):
             return _withhold(ReasonCode.PLACE_WITHOUT_POSITION)
         if event.view.reason:
             return _withhold(ReasonCode.NOT_BELOW_AIRCRAFT)
-        vehicle, time_error_m = self._vehicle, shared_time_error_m(event, event.vehicle or self._vehicle)
+        vehicle, time_error_m = self._vehicle, compute_time_error_m(event, event.vehicle or self._vehicle)
         accuracy_m = math.hypot(match.accuracy_m, time_error_m)
         fix = Fix(match.position.lat_deg, match.position.lon_deg, accuracy_m, match.t_s)
         if vehicle is None or not vehicle.is_fresh(now_s):
@@ -179,7 +179,8 @@ class Navigator(Listener):
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
-            self._navigation.start_at_fix(match.position, worst_sd(match.scatter_m2), match.t_s, vehicle.t_received_s)
+            sd_m = compute_worst_sd(match.scatter_m2)
+            self._navigation.start_at_fix(match.position, sd_m, match.t_s, vehicle.t_received_s)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
         verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
         if verdict.reason:

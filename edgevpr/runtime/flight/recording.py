@@ -53,7 +53,7 @@ class Recording(Tape):
         self._closing = threading.Event()
         try:
             Path(folder).mkdir(mode=0o750, exist_ok=True)
-            last = max((int(path.name.rpartition("-")[2]) for path in recordings(Path(folder))), default=0)
+            last = max((int(path.name.rpartition("-")[2]) for path in list_recordings(Path(folder))), default=0)
             self.path = Path(folder) / f"flight-{last + 1:04d}"
             self.path.mkdir(mode=0o750)
             (self.path / FRAMES).mkdir(mode=0o750)
@@ -83,7 +83,7 @@ class Recording(Tape):
             line = json.dumps([kind, *values], default=lambda data: b64encode(data).decode())
             self._queue.append(redact_passwords(line).encode() + b"\n")
 
-    def keep(self, jpeg: bytes) -> int:
+    def store_frame(self, jpeg: bytes) -> int:
         """Record a picture, and return its number in this recording (1, 2, ...), for `frame_path`."""
         self._frames += 1
         if self.state is None:
@@ -143,7 +143,7 @@ class Recording(Tape):
         sync_file(self._tape)
 
     def _delete_oldest(self) -> None:
-        *earlier, _ = recordings(self.path.parent)
+        *earlier, _ = list_recordings(self.path.parent)
         sizes = {path: sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) for path in earlier}
         for folder in earlier:
             if sum(sizes.values()) <= self._max_bytes:
@@ -202,7 +202,7 @@ def has_live_source(folder: Path) -> bool:
         return any(line.startswith(b'["is_live", true') for line in tape)
 
 
-def recordings(folder: Path) -> list[Path]:
+def list_recordings(folder: Path) -> list[Path]:
     """List the folders of the recordings in `folder`, oldest first."""
     numbered = [(int(match[1]), path) for path in folder.iterdir() if (match := _FOLDER_PATTERN.fullmatch(path.name))]
     return [path for _, path in sorted(numbered)]

@@ -108,12 +108,12 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
         "python": platform.python_version(),
         "libraries": {name: version for name, version in versions.items() if version},
         "map": config.map,
-        "map_identity": _identity(place_map),
+        "map_identity": _identify_map(place_map),
         "config": asdict(config),
     }
 
 
-def _identity(place_map: PlaceMap) -> MapIdentity | None:
+def _identify_map(place_map: PlaceMap) -> MapIdentity | None:
     """Return the identity of a map; None if it cannot be identified."""
     try:
         return read_identity(place_map)

@@ -20,7 +20,7 @@ from edgevpr.core.geodesy import move_position, offset_between_m
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.receivers import extrapolate
-from edgevpr.runtime.flight.measurements import FrameMeasurement, picture_error_m, position_match
+from edgevpr.runtime.flight.measurements import FrameMeasurement, compute_picture_error_m, position_match
 from edgevpr.runtime.flight.navigation import is_gps_aided
 from edgevpr.runtime.recognise.locate import mahalanobis
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -127,7 +127,7 @@ class MapSurvey:
         if view.nadir_offset is None and view.nadir_offset_m is None:
             return False
         t_s, height_m = event.frame.t_mono_s, located.height_m or vehicle.height_m
-        frame_sd_m = picture_error_m(vehicle, height_m or 0.0, event.frame.t_sd_s)
+        frame_sd_m = compute_picture_error_m(vehicle, height_m or 0.0, event.frame.t_sd_s)
         match = position_match(event, FrameMeasurement(t_s=t_s, sd_m=frame_sd_m))
         jacobian = self._compute_jacobian(vehicle, height_m, match.heading_error_deg or 0.0) if match else None
         if match is None or jacobian is None or not vehicle.is_fresh(t_s):

@@ -49,7 +49,7 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.points)
 
-    def best(self, count: int) -> "Landmarks":
+    def select_best(self, count: int) -> "Landmarks":
         """Return the `count` best landmarks."""
         return Landmarks(self.points[:count], self.angle_deg[:count], self.size[:count], self.bits[:count])
 

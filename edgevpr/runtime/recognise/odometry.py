@@ -55,7 +55,7 @@ class VisualOdometry:
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
-        last, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
+        last, self._previous = self._previous, (t_s, view, landmarks.select_best(PLACE_LANDMARKS))
         if last is None or not 0 < t_s - last[0] <= _MAX_ELAPSED_S:
             return None
         from_s, start, previous = last

@@ -125,7 +125,7 @@ class PlaceFilter:
         geometry, near = self._geometry, self._geometry.scale.near
         slots, proposed = _make_proposals(ranking, index, geometry, rule, evidence, located)
         self._next = copy.copy(self._belief)
-        posterior = self._next.update(proposed, self._motion(geometry), len(index))
+        posterior = self._next.update(proposed, self._make_motion(geometry), len(index))
         slot, confidence = None, 0.0
         if len(slots) and posterior.probability.max() > 0:
             best = int(posterior.probability.argmax())
@@ -149,7 +149,7 @@ class PlaceFilter:
         """Process a picture with too little texture to tell whether the aircraft is over the map."""
         if self._geometry and self._belief:
             self._next = copy.copy(self._belief)
-            self._next.update(None, self._motion(self._geometry), len(index))
+            self._next.update(None, self._make_motion(self._geometry), len(index))
             self.commit()
 
     def commit(self) -> None:
@@ -157,7 +157,7 @@ class PlaceFilter:
         self._belief, self._next = self._next or self._belief, None
         self._first_view, self._t_committed_s = self._next_first_view, self._t_now_s
 
-    def _motion(self, geometry: _MapGeometry) -> Motion:
+    def _make_motion(self, geometry: _MapGeometry) -> Motion:
         if geometry.scale.is_ordinal or self._elapsed_s is None:
             return make_motion(None, _MAX_PLACES_PER_QUERY * geometry.scale.spacing)
         if self._odometry and self._elapsed_s > 0:

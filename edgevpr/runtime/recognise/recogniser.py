@@ -172,7 +172,7 @@ class Recogniser:
         )
 
     def _compute_accuracy_m(self, located: Located, view: View) -> float:
-        """Return the accuracy of a position in the world: with errors of the map and of the reported tilt."""
+        """Return the accuracy of a position on the Earth, with the errors of the map and of the reported tilt."""
         tilt_m = REPORTED_TILT_SD * (located.height_m or 0.0) if view.is_tilt_known else 0.0
         return max(self._settings.min_accuracy_m, math.hypot(located.accuracy_m, tilt_m))
 

@@ -22,7 +22,7 @@ class Scripted(FlightMeter):
         super().__init__(battery, board, clock)
         self._readings, self._begin_s, self._now = readings, clock.mono_s(), clock.mono_s
 
-    def reading(self):
+    def read_load(self):
         turn = round((self._now() - self._begin_s) / TURN_S) - 1
         return self._readings[turn] if turn < len(self._readings) else CALM
 

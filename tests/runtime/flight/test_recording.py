@@ -15,7 +15,7 @@ from edgevpr.frames.images import read_image
 from edgevpr.review.tape import Playback, ReplayedSource, read_tape
 from edgevpr.runtime.flight import recording as module
 from edgevpr.runtime.flight.boundary import RecordedSource
-from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, recordings
+from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, list_recordings
 
 
 def notes(folder):
@@ -37,7 +37,7 @@ def test_recording_gives_the_flight_the_stored_image(tmp_path, is_grey):
     pictures = pictures if is_grey else [np.dstack((each, 255 - each, each // 2)) for each in pictures]
     clock = FakeClock()
     with Recording(tmp_path, 100) as tape:
-        source = RecordedSource(FakeSource([*pictures, ImageError("it is torn")], clock), tape, tape.keep)
+        source = RecordedSource(FakeSource([*pictures, ImageError("it is torn")], clock), tape, tape.store_frame)
         seen = [source.read(0.2) for _ in pictures]
         with pytest.raises(ImageError):
             source.read(0.2)
@@ -63,23 +63,23 @@ def test_recording_hides_passwords_in_addresses(tmp_path):
 def test_recording_uses_one_folder_per_flight_and_deletes_the_oldest(tmp_path):
     for number in range(4):
         with Recording(tmp_path, 10) as tape:
-            tape.keep(bytes(2_000_000))
+            tape.store_frame(bytes(2_000_000))
             tape.note("x")
         assert tape.path.name == f"flight-{number + 1:04d}"
     with Recording(tmp_path, 10):  # the half of 10 MB is to be free
-        wait_until(lambda: len(recordings(tmp_path)) < 5)
-    assert [each.name for each in recordings(tmp_path)] == ["flight-0003", "flight-0004", "flight-0005"]
+        wait_until(lambda: len(list_recordings(tmp_path)) < 5)
+    assert [each.name for each in list_recordings(tmp_path)] == ["flight-0003", "flight-0004", "flight-0005"]
 
 
 @pytest.mark.slow
 def test_recording_ends_at_its_size_limit_and_reports_it(tmp_path, caplog):
     with caplog.at_level(logging.WARNING), Recording(tmp_path, 10) as tape:
         for _ in range(4):
-            tape.keep(bytes(1_500_000))
+            tape.store_frame(bytes(1_500_000))
             tape.note("frame")
             wait_until(lambda: not tape._queue)
         wait_until(lambda: tape.state)
-        tape.keep(b"no more")
+        tape.store_frame(b"no more")
         tape.note("no more")
     assert "log.record_mb" in tape.state
     assert sum("has ended" in each.message for each in caplog.records) == 1
@@ -93,7 +93,7 @@ def test_recording_ends_on_a_full_disk_without_ending_the_flight(tmp_path):
         tape.note("x")
         wait_until(lambda: not tape._queue)
         with no_file_larger_than(5000):
-            tape.keep(bytes(9000))
+            tape.store_frame(bytes(9000))
             tape.note("frame")
             wait_until(lambda: tape.state)
         tape.note("later")

@@ -205,7 +205,7 @@ def test_compare_near_ignores_displays_and_nearby_overlays():
         ((0.0, 0.0), 0.0, None, False),
     ],
 )
-def test_agreement_is_at_rest_without_shift_rotation_or_scaling(shift, rotation_deg, scale, is_unshifted):
+def test_agreement_is_unshifted_without_shift_rotation_or_scaling(shift, rotation_deg, scale, is_unshifted):
     shown = {"shift_share": shift, "rotation_deg": rotation_deg, "scale": scale}
     assert Agreement(inliers=20, matched=20, possible=20, **shown).is_unshifted is is_unshifted
 

@@ -241,7 +241,7 @@ def test_judge_refuses_unshifted_matches_of_other_places_as_an_overlay(share, ac
         ((0.0, 0.0), None, None, False),
     ],
 )
-def test_is_at_rest_requires_no_shift_rotation_or_height_change(shift_cells, rotation_deg, height_ratio, expected):
+def test_is_unshifted_requires_no_shift_rotation_or_height_change(shift_cells, rotation_deg, height_ratio, expected):
     match = FineMatch(0.3, shift_cells=shift_cells, rotation_deg=rotation_deg, height_ratio=height_ratio)
     assert is_unshifted(match) is expected
 

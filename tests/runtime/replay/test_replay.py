@@ -15,7 +15,7 @@ from edgevpr.cli.main import main
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.review.compare import compare_lines
 from edgevpr.review.replay import replay
-from edgevpr.runtime.flight.recording import TAPE, recordings
+from edgevpr.runtime.flight.recording import TAPE, list_recordings
 
 pytestmark = pytest.mark.slow
 
@@ -100,7 +100,7 @@ def test_replay_of_a_killed_flight_ends_with_its_tape(fly, tmp_path):
     again, _ = is_the_same(log)
     assert again.why_ended
     assert len(of_kind(again.lines, "query")) >= 2, "what is half a second old is on the disk"
-    tape = recordings(tmp_path / "recorded")[-1] / TAPE
+    tape = list_recordings(tmp_path / "recorded")[-1] / TAPE
     first, rest = tape.read_bytes().split(b"\n", 1)
     for share in (0.1, 0.6):  # a power cut, at any byte
         tape.write_bytes(first + b"\n" + rest[: round(share * len(rest))])
@@ -126,7 +126,7 @@ def test_replay_ignores_only_the_signature_of_signed_packets(fly, tmp_path):
     assert (tmp_path / "time").exists()
     assert again.packets.alike > 0
     assert again.lines[-1]["mavlink"]["refused_signatures"] == {"unsigned": 1}
-    tape = (recordings(tmp_path / "recorded")[-1] / TAPE).read_text()
+    tape = (list_recordings(tmp_path / "recorded")[-1] / TAPE).read_text()
     assert bytes(range(32)).hex() not in tape
 
 
