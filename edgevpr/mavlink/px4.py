@@ -35,7 +35,7 @@ class Px4Fusion:
         self._sent_s, self._is_vision = -math.inf, False
         self._unused_since_s: float | None = None
         self._reports_fusion = False  # before 1.16 the flag means a position from any source
-        self._takes_velocity = False
+        self._fuses_velocity = False
         self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
 
     @property
@@ -71,9 +71,9 @@ class Px4Fusion:
             self.used, self.unused = self.used + is_used, self.unused + (not is_used)
         if not self._reports_fusion:
             return
-        took_velocity = self._takes_velocity
-        self._takes_velocity = takes_velocity = math.isfinite(report.vel_ratio) and report.vel_ratio > 0
-        if takes_velocity and not took_velocity:
+        fused_velocity = self._fuses_velocity
+        self._fuses_velocity = fuses_velocity = math.isfinite(report.vel_ratio) and report.vel_ratio > 0
+        if fuses_velocity and not fused_velocity:
             self._next_try_s = -math.inf
         if receiver is None:
             self._unused_since_s = None
@@ -84,8 +84,8 @@ class Px4Fusion:
             self._infer_gps_use(is_fusing, now_s)
         elif not self.uses_gps or silent_s < _SENDING_TIMEOUT_S:
             is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S
-            self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_trusted
-        elif not takes_velocity:
+            self._unused_since_s, self.uses_gps = None, fuses_velocity and is_due and is_trusted
+        elif not fuses_velocity:
             self._infer_gps_use(False, now_s)  # PX4 does not use GPS although we stopped sending
 
     def _infer_gps_use(self, is_fusing: bool, now_s: float) -> None:

@@ -67,7 +67,7 @@ class Flight:
         self._parts, self._opened = parts, ExitStack()
         notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()
         self._pace = Pace(parts.io.board.rate_hz, parts.io.clock)
-        self._governing = GovernorActuator(parts, self._pace, fewer_candidates)
+        self._actuator = GovernorActuator(parts, self._pace, fewer_candidates)
         self._commands = Commands(parts.link, notifier)
         self._frozen = FrozenWatch(notifier, read_optics(camera, parts.recogniser), parts.autopilot)
         self._vitals = Vitals(
@@ -158,7 +158,7 @@ class Flight:
 
     def _remarks(self) -> tuple[str | None, ...]:
         """Return short remarks for the status, in addition to the counts (None: nothing to report)."""
-        restriction = self._governing.governor.restriction
+        restriction = self._actuator.governor.restriction
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
         return self._commands.summary, age, restriction, self._map_watch.summary, self._parts.flight_log.fault
 
@@ -194,7 +194,7 @@ class Flight:
                 meter.count(event)
                 self._parts.autopilot.add_motion(event)
         meter.load.add_work(work.cost)
-        self._governing.update()  # here, so that each measurement covers a whole number of queries
+        self._actuator.update()  # here, so that each measurement covers a whole number of queries
 
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
         """Recognise a frame or, unless `is_query`, only measure its motion; refuse frozen pictures."""

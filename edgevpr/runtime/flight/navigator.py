@@ -307,8 +307,8 @@ class Navigator(Listener):
         position, claimed_m = estimate.position, self._compute_claimed_m(estimate)
         east_m_s, north_m_s = velocity_m_s
         age_s = now_s - vehicle.t_received_s
-        theirs_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
-        error_m = float(distance_m(*theirs_deg, position.lat_deg, position.lon_deg))
+        autopilot_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
+        error_m = float(distance_m(*autopilot_deg, position.lat_deg, position.lon_deg))
         # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by error_m**2.
         if error_m**2 <= 2 * estimate.accuracy_m**2:
             figures = {"distance_m": error_m, "accuracy_m": estimate.accuracy_m}

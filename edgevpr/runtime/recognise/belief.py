@@ -146,7 +146,7 @@ class Belief:
 
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
-        self._strongest, self._lost, self._enters = 0.0, 1.0, 0.5  # as in the prior of the proposals
+        self._strongest, self._lost, self._enter_chance = 0.0, 1.0, 0.5  # as in the prior of the proposals
         shapes = {"weight": 0, "position": (0, 2), "covariance": (0, 2, 2), "velocity": (0, 2), "heading": (0, 2)}
         shapes |= {"credited": 0, "anchor": (0, 2)}
         self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
@@ -155,17 +155,17 @@ class Belief:
         """Update the belief with the candidates that a query proposes (None: too little texture in its picture; those
         that are not finite are ignored), the motion since the previous query, and the number of places in the map."""
         odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)  # of not being lost
-        now, lost, appears = self._apply_transitions()
+        now, lost, arrival = self._apply_transitions()
         moves = self._predict_motions(now, motion, places)
         probability = np.zeros(0 if proposed is None else len(proposed.probability))
         indices: Ints = np.zeros(0, int)
         if proposed is None:
-            lost += appears  # an aircraft that enters the map now is at an unknown place
+            lost += arrival  # an aircraft that enters the map now is at an unknown place
             updated = _predict_misses(now, moves, 1.0)
         else:
-            self._enters = _ENTER_CHANCE
+            self._enter_chance = _ENTER_CHANCE
             indices, proposed = _select_usable(proposed, self._scale)
-            hits, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, appears, places)
+            hits, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, arrival, places)
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
             misses = _predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
@@ -185,13 +185,13 @@ class Belief:
         """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the
         probability of being lost, and that of having entered or jumped to any place."""
         on_map = float(self._now.weight.sum())
-        lost = (1 - self._enters) * self._lost + _LEAVE_CHANCE * on_map
-        stays = 1 - _LEAVE_CHANCE - _JUMP_CHANCE
-        leaked = max(0.0, math.log(max(lost, _MIN_DIVISOR) / max(stays * self._lost, _MIN_DIVISOR)))
-        self._strongest = max(0.0, self._strongest - leaked)
-        credited = np.maximum(self._now.credited - leaked, 0)
-        now = replace(self._now, weight=stays * self._now.weight, credited=credited)
-        return now, lost, self._enters * self._lost + _JUMP_CHANCE * on_map
+        lost = (1 - self._enter_chance) * self._lost + _LEAVE_CHANCE * on_map
+        stay_chance = 1 - _LEAVE_CHANCE - _JUMP_CHANCE
+        leak = max(0.0, math.log(max(lost, _MIN_DIVISOR) / max(stay_chance * self._lost, _MIN_DIVISOR)))
+        self._strongest = max(0.0, self._strongest - leak)
+        credited = np.maximum(self._now.credited - leak, 0)
+        now = replace(self._now, weight=stay_chance * self._now.weight, credited=credited)
+        return now, lost, self._enter_chance * self._lost + _JUMP_CHANCE * on_map
 
     def _predict_motions(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Prediction]:
         """Return the possible motions of each hypothesis: from odometry, at constant velocity, or anywhere in reach."""
@@ -225,7 +225,7 @@ class Belief:
         now: _Hypotheses,
         moves: list[_Prediction],
         elapsed_s: float,
-        appears: float,
+        arrival: float,
         places: int,
     ) -> tuple[_Hypotheses, float, float, float]:
         """Weight the candidates by the hypotheses that can have moved to them. Returns
@@ -236,9 +236,9 @@ class Belief:
         * the factor, at most 1, by which the odds of not being lost shrink if this query is weaker evidence there.
         """
         scale, position, cov = self._scale, proposed.position, proposed.covariance
-        rest = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.probability.sum()))
-        ratio = np.log(np.maximum(proposed.probability, _MIN_DIVISOR) * places / rest)
-        appeared = appears / places * np.exp(ratio)
+        p_none = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.probability.sum()))
+        ratio = np.log(np.maximum(proposed.probability, _MIN_DIVISOR) * places / p_none)
+        arrival_weight = arrival / places * np.exp(ratio)
 
         # A picture of the same ground repeats the previous evidence. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
@@ -254,10 +254,11 @@ class Belief:
         weight = sum(matrix.sum(0) for matrix in weights)
         origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): fraction of a candidate's weight
         stale = origin * (1 - fresh)
-        staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + appeared).sum()))
+        staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + arrival_weight).sum()))
         newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
         odds_factor = math.exp(min(0.0, newest - before))
-        agreement = float(weight.sum()) * rest / max(_MIN_DIVISOR, float(now.weight.sum() * proposed.probability.sum()))
+        expected = float(now.weight.sum() * proposed.probability.sum())
+        agreement = float(weight.sum()) * p_none / max(_MIN_DIVISOR, expected)
         likelihood = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.weight) else 1.0
 
         predicted_position, predicted_cov = mix_gaussians(
@@ -270,9 +271,9 @@ class Belief:
         kept = (1 - gain) * np.nan_to_num(now.velocity) - gain * now.position / elapsed_s
         velocity = (origin.T @ gain) * position / elapsed_s + origin.T @ kept
         anchor = (1 - stale.sum(0))[:, None] * position + stale.T @ now.anchor
-        is_continued, heading = (weight > appeared)[:, None], np.radians(proposed.heading_deg)
+        is_continued, heading = (weight > arrival_weight)[:, None], np.radians(proposed.heading_deg)
         hypotheses = _Hypotheses(
-            weight=math.exp(-staleness * repeated) * (weight + appeared),
+            weight=math.exp(-staleness * repeated) * (weight + arrival_weight),
             position=np.where(is_continued, fused_position, position),
             covariance=np.where(is_continued[..., None], fused_cov, cov),
             velocity=np.where(is_continued, velocity, np.nan),

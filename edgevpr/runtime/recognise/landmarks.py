@@ -94,14 +94,14 @@ def _select_spread(points_px: Singles, count: int, cell_px: float) -> Ints:
     one in every cell of a grid, then the second best, and so on."""
     # Keep only the best of several points at one corner.
     _, first = np.unique(np.rint(points_px / _MIN_DISTANCE_PX).astype(int), axis=0, return_index=True)
-    kept = np.sort(first)
-    _, cell = np.unique((points_px[kept] // cell_px).astype(int), axis=0, return_inverse=True)
+    unique = np.sort(first)
+    _, cell = np.unique((points_px[unique] // cell_px).astype(int), axis=0, return_inverse=True)
     by_cell = np.argsort(cell.ravel(), kind="stable")
     ordered = cell.ravel()[by_cell]
     starts = np.searchsorted(ordered, ordered)
-    rank = np.empty(len(kept), int)
-    rank[by_cell] = np.arange(len(kept)) - starts
-    return kept[np.argsort(rank, kind="stable")[:count]]
+    rank = np.empty(len(unique), int)
+    rank[by_cell] = np.arange(len(unique)) - starts
+    return unique[np.argsort(rank, kind="stable")[:count]]
 
 
 def pack_bytes(landmarks: Landmarks) -> bytes:

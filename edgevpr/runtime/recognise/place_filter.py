@@ -227,12 +227,12 @@ def _make_proposals(
         probability[is_near & ~is_same] = confidence * _compute_weights(votes[is_near & ~is_same])
         probability[~is_near & ~is_same] = others * _compute_weights(votes[~is_near & ~is_same])
     # The probability of a place without a position is not given to other places.
-    kept = ~np.isnan(positions[:, 0]) & ~is_same
-    return slots[kept], Proposals(
-        probability=probability[kept],
-        position=positions[kept],
-        covariance=covariance[kept],
-        heading_deg=heading_deg[kept],
+    is_proposed = ~np.isnan(positions[:, 0]) & ~is_same
+    return slots[is_proposed], Proposals(
+        probability=probability[is_proposed],
+        position=positions[is_proposed],
+        covariance=covariance[is_proposed],
+        heading_deg=heading_deg[is_proposed],
     )
 
 
