@@ -191,8 +191,8 @@ def _check_arming(parameters: Parameters, choice: ChannelChoice) -> Iterator[str
 _RULES = (
     require(_GPS_INPUT, "the index of the real receiver: 0 if GPS2_TYPE is 14, 1 if GPS1_TYPE is",
         Check(("GPS_PRIMARY", "GPS_AUTO_SWITCH", *RECEIVERS), _check_primary),
-        "With GPS_AUTO_SWITCH 0 or 4 it uses the primary receiver, which is ours, even while GPS is good."),
-    recommend(_GPS_INPUT, "1; 4 is as good",
+        "With GPS_AUTO_SWITCH 0 or 4 ArduPilot uses the primary receiver, which is ours, even while GPS is good."),
+    recommend(_GPS_INPUT, "1 or 4",
         Check(("GPS_AUTO_SWITCH", "GPS_PRIMARY", "GPS_BLEND_MASK", *RECEIVERS), _check_switch),
         "With 0 our receiver is never used; with 2 it contributes to each position while GPS is good."),
     require(_GPS_INPUT, "1 or 5 if GPS_AUTO_SWITCH is 2",
@@ -205,7 +205,7 @@ _RULES = (
     require(_GPS_INPUT,
         f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends the position at that age (0: 0.2 s)",
         _check_own_receiver(*(expect(0, name, allows=make_limit(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
-        "The filter's buffer is shorter, so it would treat our position as a newer one.", "GPSn_DELAY_MS"),
+        "With a larger delay, which exceeds its buffer, the filter treats our position as newer.", "GPSn_DELAY_MS"),
     # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: the offset is subtracted from our position.
     require(_GPS_INPUT, f"within {MAX_OFFSET_M:g} m of 0 for our receiver",
         _check_own_receiver(*(expect(0, *list_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
@@ -231,19 +231,19 @@ _RULES = (
         "With 0 the filter accepts every position, even a wrong one; with a larger value it recovers late."),
     recommend(_CONTINUOUS,
         "1, or with bits 8 (GPS) and 262144 (vision); newer firmware: ARMING_SKIPCHK without these bits",
-        Check(("ARMING_CHECK",), _check_arming), "It arms even if our positions are missing or contradict GPS."),
+        Check(("ARMING_CHECK",), _check_arming), "ArduPilot arms even if our positions are missing or contradict GPS."),
     # AP_VisualOdom_MAV.cpp: VISO_VEL_M_NSE is used as the accuracy, whatever we send.
     require(_ODOMETRY, "not 6", _refuse_source("VELXY", _SOURCE_VISION, correct=0),
         "Our velocity comes from the same matches as our position; the filter would trust it more than its gyros.",
         "EK3_SRCn_VELXY"),
     require(_ODOMETRY, "POSZ, VELZ and YAW not 6",
         join_checks(*(_refuse_source(*source) for source in _OWN_SOURCES)),
-        "Height, climb and heading in our ODOMETRY are the autopilot's own: it would confirm itself.", "EK3_SRCn_*"),
+        "Height, climb and heading in our ODOMETRY are the autopilot's own: it would confirm them.", "EK3_SRCn_*"),
     require(_ODOMETRY, "without bit 8, if one source set uses GPS and one uses our positions",
         Check(("EK3_SRC_OPTIONS", *_name_sources("POSXY")), _check_set_per_lane),
         "Each lane of the filter has its own source set, so one lane uses our positions while GPS is good."),
     require(_ODOMETRY, "1", expect(1, "VISO_SCALE"),  # AP_VisualOdom_MAV, handle_pose_estimate
-        "It scales the distance of our position from the origin."),
+        "Any other value scales the distance of our position from the origin."),
     # AP_VisualOdom_Backend.cpp rotates VISION_POSITION_DELTA only; AP_VisualOdom_IntelT265.cpp rotates all messages.
     recommend(_ODOMETRY, "0", expect(0, "VISO_ORIENT"),
         "Our positions must not be rotated; 4.7 does not rotate positions of ODOMETRY, but that may change."),
@@ -255,7 +255,7 @@ _RULES = (
         "We send the current position, which would be treated as an old one."),
     require(_ODOMETRY, "0 to 100",  # AP_VisualOdom_MAV.cpp, handle_pose_estimate
         expect(0, "VISO_QUAL_MIN", allows=lambda quality: quality >= 0),
-        "With -1 even a position that we mark as bad is used."),
+        "With -1 even positions that we mark as bad are used."),
     recommend(_ODOMETRY, f"up to {_MAX_VISION_SD_M}",  # handle_pose_estimate: the minimum standard deviation
         expect(0.2, "VISO_POS_M_NSE", allows=make_limit(_MAX_VISION_SD_M)),
         "With a larger value, an accurate position has no more weight than an inaccurate one."),

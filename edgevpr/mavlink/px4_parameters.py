@@ -53,29 +53,29 @@ _RULES = (
         expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _GPS_POSITION_BIT)),
         "Only our positions are used, not GPS: this is for an aircraft without GPS."),
     require(_ALL_CHANNELS, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
-        "GPS that recovers far from our position is rejected as long as airspeed or optical flow is used."),
+        "GPS that recovers far from our position is rejected while airspeed or optical flow is used."),
     recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _HEIGHT_FROM_VISION),
-        "We send no height: with 3 (vision) it never becomes ready to arm."),  # flown
+        "We send no height: with 3 (vision) PX4 never becomes ready to arm."),  # flown
     recommend(_ALL_CHANNELS, "1", expect(1, "SYS_HAS_GPS"),
-        "With 0 it arms without GPS, so the start position may be unknown: this is for an aircraft without GPS."),
+        "With 0 PX4 arms without GPS, so the start position may be unknown: this is for an aircraft without GPS."),
     # aux_global_position.cpp: a slot whose ID is 0 at startup does not exist.
     recommend(_MESSAGE_296, f"{SENSOR_ID}", expect(SENSOR_ID, "EKF2_AGP0_ID"),
         "Our positions carry this ID; with any other value they are not used."),
     require(_MESSAGE_296, f"1, the default; up to {_MAX_SD_M}",  # flown
         expect(1, "EKF2_AGP0_NOISE", allows=make_limit(_MAX_SD_M)),
-        "It hardly follows our positions, and accepts ones that are far off: with 50 it was 20 m off, undetected."),
+        "PX4 hardly follows our positions and accepts wrong ones: with 50 it was wrong by 20 m, undetected."),
     require(_MESSAGE_296, f"3, the default; up to {_MAX_GATE_SD}",
         expect(3, "EKF2_AGP0_GATE", allows=make_limit(_MAX_GATE_SD)),  # fuseHorizontalPosition
         "The filter accepts every position, even a wrong one."),
     recommend(_MESSAGE_296, "0", expect(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
-        "With airspeed or optical flow it never returns to our positions once they are outside the gate."),
+        "With airspeed or optical flow PX4 never returns to our positions once they are outside the gate."),
     require(_MESSAGE_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
         expect(0, "EKF2_AGP0_DELAY", allows=make_limit(MAX_DELAY_MS)), _DELAY_CONSEQUENCE),
     require(_ODOMETRY, "0", expect(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
         "With 1 each position is assumed to be accurate to EKF2_EVP_NOISE (0.1 m), whatever we claim."),
     require(_ODOMETRY, f"0.1, the default; up to {_MAX_SD_M}",  # flown
         expect(0.1, "EKF2_EVP_NOISE", allows=make_limit(_MAX_SD_M)),
-        "It hardly follows our positions, and accepts ones that are far off: with 20 it was 35 m off, and landed."),
+        "PX4 hardly follows our positions and accepts wrong ones: with 20 it was wrong by 35 m, and landed."),
     require(_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
         expect(5, "EKF2_EVP_GATE", allows=make_limit(_MAX_GATE_SD)),  # ev_pos_control.cpp, controlEvPosFusion
         "The filter accepts every position, even a wrong one."),
