@@ -181,7 +181,7 @@ def followed(name: str, models: dict[str, Models]) -> base.Row:
         "leave": own[:middle] + foreign + own[middle:],
     }
     made: base.Row = {"set": name, "ways": {}}
-    with walks.map_of(DATA / name) as (place_map, index, technique):
+    with walks.make_map(DATA / name) as (place_map, index, technique):
         rule = make_accept_rule(technique, walks.config().match)
         rule = replace(rule, confidence_rule=ConfidenceRule(models[name], walks.config().match.accept_precision))
         for way, paths in ways.items():

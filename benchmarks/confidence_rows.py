@@ -64,7 +64,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
     """Ask the map of the set `name`, which lies in `folder`."""
     dataset = walks.dataset_of(folder)
     scored = {query.path.name: query for query in dataset.queries}
-    with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
+    with walks.make_map(folder, images=folder / "ref") as (place_map, index, technique):
         rule = make_accept_rule(technique, walks.config().match)
         rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))  # only objections refuse
         walk = walks.walk(place_map, index, technique, rule=rule, all_evidence=True)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import walks
 from base import DATA, Row, camera_of
-from pictures_of_nothing import SPOILT, display, figures, pictures, spoilt
+from pictures_of_nothing import SPOILT, display, figures, pictures, yield_spoilt
 
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate.dataset import Dataset
@@ -82,7 +82,7 @@ def _bare(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Gene
     queries = -(-count // len(SPOILT))
     for number in rng.choice(len(dataset.queries), queries, replace=queries > len(dataset.queries)):
         query = dataset.queries[number]
-        for _, image in spoilt(seed + int(number), read_image(query.path)):
+        for _, image in yield_spoilt(seed + int(number), read_image(query.path)):
             yield "spoilt", image, query.right | query.ignored
     for kind, same_camera in (("of other sites", True), ("of the other camera", False)):
         for image in _foreign(dataset, folders, count, rng, same_camera):

@@ -27,7 +27,7 @@ def measure(name: str) -> base.Row:
     folder = DATA / name
     dataset = walks.dataset_of(folder)
     row: base.Row = {"set": name, "queries": len(dataset.queries), "right": 0, "unproven": 0, "wrong": 0, "left_out": 0}
-    with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
+    with walks.make_map(folder, images=folder / "ref") as (place_map, index, technique):
         calibration = read_calibration_for(place_map)
         beside = _BESIDE_LEFT_OUT if count_neighbours(calibration.look_alikes if calibration else None) else 0
         walk, slots = walks.walk(place_map, index, technique), np.arange(len(index))

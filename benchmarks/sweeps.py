@@ -96,7 +96,7 @@ def swept(folder: Path) -> list[Row]:
         asked = []
         for name in TECHNIQUES:
             technique, shown = create(name, {"camera": camera} if name == "cohog" else {}), Shown()
-            place_map, index, _ = stack.enter_context(walks.map_of(folder, technique, folder / "ref"))
+            place_map, index, _ = stack.enter_context(walks.make_map(folder, technique, folder / "ref"))
             walk = walks.walk(place_map, index, technique, levelling=shown)
             asked.append((walk, shown, walks.names_of(place_map, index)))
         unchanged = _asked(asked, starts, camera, "yaw", 0)

@@ -22,7 +22,7 @@ def picture(number):
     return np.roll(cv2.GaussianBlur(_NOISE, (9, 9), 0), 7 * number, axis=1)
 
 
-def encoded(number, extension=".jpg"):
+def encode_image(number, extension=".jpg"):
     return bytes(cv2.imencode(extension, picture(number))[1])
 
 
@@ -88,7 +88,7 @@ def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connectio
         if connections is not None:
             connections.append(sent_s)
         for number in itertools.count():
-            data = encoded(number, extension)
+            data = encode_image(number, extension)
             length = f"Content-Length: {len(data)}\r\n" if has_length else ""
             sent_s.append(time.monotonic())
             connection.sendall(f"--part\r\nContent-Type: {kind}\r\n{length}\r\n".encode() + data + b"\r\n")

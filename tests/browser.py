@@ -19,7 +19,7 @@ def data_of(content: str) -> Any:
 
 
 @contextmanager
-def driven() -> Iterator[Any]:
+def launch_browser() -> Iterator[Any]:
     """A browser of Playwright, to be driven; skips the test where there is none."""
     playwright = pytest.importorskip("playwright.sync_api")
     path = next(filter(None, map(shutil.which, NAMES)), None)
@@ -32,7 +32,7 @@ def driven() -> Iterator[Any]:
 
 
 @contextmanager
-def opened(browser: Any, path: Path, width_px: int = 390) -> Iterator[Any]:
+def open_page(browser: Any, path: Path, width_px: int = 390) -> Iterator[Any]:
     """A page that is open; at its end nothing may have been asked for, and nothing complained of."""
     context = browser.new_context(viewport={"width": width_px, "height": 800})
     page, said = context.new_page(), []

@@ -47,7 +47,7 @@ def documented(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def heard():
+def reset_quiet():
     """After a test that called a command with -q, the next one of the process is told of progress again."""
     yield
     logging.getLogger("edgevpr").setLevel(logging.NOTSET)

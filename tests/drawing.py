@@ -25,7 +25,7 @@ def write_text(
     cv2.putText(picture, text, where, int(rng.choice(_FONTS)), scale, colour, int(rng.integers(1, 4)), cv2.LINE_AA)
 
 
-def grained(picture: np.ndarray, rng: np.random.Generator, sigma: float) -> np.ndarray:
+def add_grain(picture: np.ndarray, rng: np.random.Generator, sigma: float) -> np.ndarray:
     return np.clip(picture + rng.normal(0, sigma, picture.shape), 0, 255).astype(np.uint8)
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def no_file_larger_than(limit_bytes: int) -> Iterator[None]:
+def limit_file_size(limit_bytes: int) -> Iterator[None]:
     """Writes past the limit fail, and the one that crosses it is cut. Python ignores the signal that comes with it.
 
     Where a command prints, its output must be captured in memory (`capsys`): pytest's own capture is a file.

@@ -36,14 +36,14 @@ def rough_ground(side_px: int, seed: int = 3) -> np.ndarray:
     return cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def from_height(seed: int, height_ratio: float) -> np.ndarray:
+def view_at(seed: int, height_ratio: float) -> np.ndarray:
     """384 pixels square of a place, from so many times the height of its map."""
     half_px = round(384 * height_ratio / 2)
     seen = textured(seed, 800, 800)[400 - half_px : 400 + half_px, 400 - half_px : 400 + half_px]
     return cv2.resize(seen, (384, 384), interpolation=cv2.INTER_AREA if height_ratio > 1 else cv2.INTER_LINEAR)
 
 
-def seen_from_above(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
+def view_from_above(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
     """What a square camera sees over the middle of `ground`, that has turned clockwise, moved and risen so many times
     as high."""
     middle = (np.array(ground.shape[1::-1]) - 1) / 2 + (right_px, down_px)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-from drawing import any_colour, colour_shares, fill, grained, make_clouds, write_text
+from drawing import add_grain, any_colour, colour_shares, fill, make_clouds, write_text
 
 Draw = Callable[[np.random.Generator, int, int], np.ndarray]
 SIZES = ((480, 640), (360, 640), (576, 720), (240, 320), (720, 1280), (240, 640))  # height, width
@@ -21,7 +21,7 @@ def _bars(rng, height, width):
         picture[low:, left:right] = colour[::-1] if rng.random() < 0.5 else rng.integers(0, 60)
     if rng.random() < 0.7:
         write_text(picture, rng, "NO SIGNAL", (0.25, 0.55), 1.6)
-    return grained(picture, rng, rng.choice((0, 2, 6)))
+    return add_grain(picture, rng, rng.choice((0, 2, 6)))
 
 
 def _blue(rng, height, width):
@@ -29,7 +29,7 @@ def _blue(rng, height, width):
     for row in range(int(rng.integers(1, 6))):
         text = str(rng.choice(("NO SIGNAL", "VIDEO LOSS", "CH 5  5865 MHz", "CHECK CONNECTION", "RX1 LOST", "AV1")))
         write_text(picture, rng, text, (rng.uniform(0.02, 0.5), 0.15 + 0.16 * row), rng.uniform(0.6, 2))
-    return grained(picture, rng, rng.choice((0, 3)))
+    return add_grain(picture, rng, rng.choice((0, 3)))
 
 
 def _logo(rng, height, width):
@@ -87,7 +87,7 @@ def display(picture, rng):
 
 def _display_on_dark(rng, height, width):
     ground = colour_shares(make_clouds(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
-    return display(grained(ground, rng, rng.uniform(0.5, 4)), rng)
+    return display(add_grain(ground, rng, rng.uniform(0.5, 4)), rng)
 
 
 def _specks(rng, height, width):
@@ -116,7 +116,7 @@ def _interlaced(rng, height, width):
     share = np.repeat(share[:, None], width, axis=1)
     if rng.random() < 0.5:
         share = cv2.resize(np.ascontiguousarray(share.T), (width, height))
-    return grained(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3, 10)))
+    return add_grain(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3, 10)))
 
 
 def _torn(rng, height, width):
@@ -133,7 +133,7 @@ def _horizon(rng, height, width):
     line = height * rng.uniform(0.2, 0.8) + np.tan(rng.normal(0, 0.3)) * (x - width / 2)
     below = np.clip((y - line) / rng.uniform(1, 12) + 0.5, 0, 1)
     picture = colour_shares(below, any_colour(rng, 120), any_colour(rng, 0, 140))
-    return grained(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 3)), rng, rng.choice((0, 2, 5)))
+    return add_grain(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 3)), rng, rng.choice((0, 2, 5)))
 
 
 def _sky(rng, height, width):
@@ -144,7 +144,7 @@ def _sky(rng, height, width):
     if rng.random() < 0.4:
         cv2.circle(picture, (int(rng.integers(width)), int(rng.integers(height))), height // 8, (255, 255, 255), -1)
         picture = cv2.GaussianBlur(picture, (0, 0), height / 60)
-    return grained(picture, rng, rng.uniform(0, 3))
+    return add_grain(picture, rng, rng.uniform(0, 3))
 
 
 def _cap(rng, height, width):
@@ -158,13 +158,13 @@ def _cap(rng, height, width):
 def _fog(rng, height, width):
     base, depth = rng.uniform(90, 220), rng.uniform(2, 25)
     share = make_clouds(rng, height, width, rng.uniform(4, 60), 4)
-    return grained(colour_shares(share, base - depth, base + depth), rng, rng.uniform(0, 4))
+    return add_grain(colour_shares(share, base - depth, base + depth), rng, rng.uniform(0, 4))
 
 
 def _bright(rng, height, width):
     """Draw over-exposed ground: white, with a few greys left."""
     share = make_clouds(rng, height, width, rng.uniform(10, 120), 4)
-    return grained(colour_shares(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
+    return add_grain(colour_shares(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
 
 
 def _white_noise(rng, height, width):
@@ -198,7 +198,7 @@ def _blocks(rng, height, width):
     size = int(rng.choice((8, 16, 32)))
     small = rng.normal(128, rng.uniform(5, 60), (-(-height // size), -(-width // size), 1))
     picture = cv2.resize(small, None, fx=size, fy=size, interpolation=cv2.INTER_NEAREST)[:height, :width, None]
-    return grained(picture + fill(height, width, 0), rng, rng.choice((0, 2)))
+    return add_grain(picture + fill(height, width, 0), rng, rng.choice((0, 2)))
 
 
 def _tiles(rng, height, width):
@@ -208,14 +208,14 @@ def _tiles(rng, height, width):
     if rng.random() < 0.3:
         cv2.circle(patch, (side_x // 2, side_y // 2), min(side_x, side_y) // 4, any_colour(rng), -1)
     times = -(-height // side_y), -(-width // side_x), 1
-    return grained(np.tile(patch, times)[:height, :width], rng, rng.choice((0, 2)))
+    return add_grain(np.tile(patch, times)[:height, :width], rng, rng.choice((0, 2)))
 
 
 def _checks(rng, height, width):
     side_y, side_x = (int(side) for side in rng.integers(6, 90, 2))
     y, x = np.mgrid[:height, :width]
     share = ((y // side_y + x // side_x) % 2).astype(np.float32)
-    return grained(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3)))
+    return add_grain(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3)))
 
 
 NOTHING: dict[str, Draw] = {
@@ -227,7 +227,7 @@ NOTHING: dict[str, Draw] = {
     "display on blank": lambda rng, *size: display(fill(*size, int(rng.choice((0, 16, 60, 128)))), rng),
     "display on dark": _display_on_dark,
     "display on fog": lambda rng, *size: display(_fog(rng, *size), rng),
-    "blank": lambda rng, *size: grained(fill(*size, any_colour(rng)), rng, rng.choice((0, 0.5, 1))),
+    "blank": lambda rng, *size: add_grain(fill(*size, any_colour(rng)), rng, rng.choice((0, 0.5, 1))),
     "specks": _specks,
     "scratches": _scratches,
     "interlaced": _interlaced,
@@ -288,7 +288,7 @@ def _smeared(rng, picture):
 
 
 def _nearly_dark(rng, picture):
-    return grained(picture * rng.uniform(0.01, 0.06), rng, rng.uniform(0.5, 3))
+    return add_grain(picture * rng.uniform(0.01, 0.06), rng, rng.uniform(0.5, 3))
 
 
 def _mostly_display(rng, picture):
@@ -305,8 +305,8 @@ SPOILT: dict[str, Spoil] = {
     "smeared": _smeared,
     "washed out": lambda rng, it: np.clip(it * rng.uniform(2, 8), 0, 255).astype(np.uint8),
     "nearly dark": _nearly_dark,
-    "foggy": lambda rng, it: grained(it * rng.uniform(0.01, 0.08) + rng.uniform(100, 200), rng, rng.uniform(0.5, 3)),
-    "noisy": lambda rng, it: grained(it, rng, rng.uniform(30, 120)),
+    "foggy": lambda rng, it: add_grain(it * rng.uniform(0.01, 0.08) + rng.uniform(100, 200), rng, rng.uniform(0.5, 3)),
+    "noisy": lambda rng, it: add_grain(it, rng, rng.uniform(30, 120)),
     "upside down": lambda rng, it: np.ascontiguousarray(it[::-1, ::-1]),
     "display on it": _mostly_display,
 }
@@ -321,7 +321,7 @@ def pictures(seed: int, count: int) -> Iterator[tuple[str, np.ndarray]]:
         yield kind, NOTHING[kind](rng, height, width)
 
 
-def spoilt(seed: int, picture: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+def yield_spoilt(seed: int, picture: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Yield a real picture once in every way that hides most of it: the kind, and a uint8 picture."""
     for number, (kind, spoil) in enumerate(SPOILT.items()):
         yield kind, spoil(np.random.default_rng((seed, number)), picture)

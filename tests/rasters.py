@@ -33,7 +33,7 @@ def write_mission(path: Path, waypoints) -> Path:
     return path
 
 
-def marked(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
+def draw_marks(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
     """Brightness of the ground, float64: 60, and 210 in the middle of each mark."""
     bright = np.full(np.shape(east_m), 60.0)
     for east, north in MARKS_M:
@@ -53,13 +53,13 @@ def grid(crs: str, pixel_m: float, side_px: int, rotation_deg: float = 0.0):
     half = side_px / 2
     to_crs = Affine(across, along, x - half * (across + along), along, -across, y - half * (along - across))
     columns, rows = np.meshgrid(np.arange(side_px) + 0.5, np.arange(side_px) + 0.5)
-    x, y = in_crs(to_crs, columns.ravel(), rows.ravel())
+    x, y = to_crs_point(to_crs, columns.ravel(), rows.ravel())
     lon_deg, lat_deg = transform(crs, "EPSG:4326", x, y)
     east_m, north_m = ground_m(lat_deg, lon_deg)
     return to_crs, east_m.reshape(columns.shape), north_m.reshape(columns.shape)
 
 
-def in_crs(to_crs, column, row):
+def to_crs_point(to_crs, column, row):
     """The coordinates of points of a picture."""
     return to_crs.a * column + to_crs.b * row + to_crs.c, to_crs.d * column + to_crs.e * row + to_crs.f
 
@@ -81,7 +81,7 @@ def marked_raster(
 ) -> Path:
     """Write the marks as a picture of three bands, whose red is brighter than its blue."""
     to_crs, east_m, north_m = grid(crs, pixel_m, side_px, rotation_deg)
-    bright = marked(east_m, north_m)
+    bright = draw_marks(east_m, north_m)
     return write_raster(path, np.stack((bright, 0.9 * bright, 0.8 * bright)).astype(np.uint8), crs, to_crs)
 
 

@@ -22,7 +22,7 @@ def dockerfile():
 
 
 @pytest.fixture(scope="module")
-def flown(dockerfile):
+def last_stage(dockerfile):
     """The instructions of the last stage, by name; of an instruction that comes again, the last."""
     lines = [each for each in dockerfile.structure if each["instruction"] != "COMMENT"]
     first = max(number for number, each in enumerate(lines) if each["instruction"] == "FROM")
@@ -48,11 +48,11 @@ def test_dockerfile_copies_enough_for_the_wheel(dockerfile, tmp_path):
     assert list(tmp_path.glob(f"dist/edgevpr-{__version__}-*.whl"))
 
 
-def test_dockerfile_runs_without_root_and_installs_nothing(dockerfile, flown):
+def test_dockerfile_runs_without_root_and_installs_nothing(dockerfile, last_stage):
     build, last = dockerfile.parent_images
     assert build == last, "another Python could not use the packages"
-    assert flown["USER"] == "edgevpr"
-    assert "pip" not in flown["RUN"]
-    assert "apt" not in flown["RUN"]
-    assert json.loads(flown["ENTRYPOINT"]) == ["edgevpr"]
-    assert json.loads(flown["CMD"]) == ["run", "--config", f"{flown['WORKDIR']}/config.yaml"]
+    assert last_stage["USER"] == "edgevpr"
+    assert "pip" not in last_stage["RUN"]
+    assert "apt" not in last_stage["RUN"]
+    assert json.loads(last_stage["ENTRYPOINT"]) == ["edgevpr"]
+    assert json.loads(last_stage["CMD"]) == ["run", "--config", f"{last_stage['WORKDIR']}/config.yaml"]

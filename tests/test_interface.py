@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import refused, run_json
-from pictures import seen_from_above, textured
+from pictures import textured, view_from_above
 
 import edgevpr
 from edgevpr.cli.main import main
@@ -24,9 +24,9 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 PLACES = 6
 
 
-def seen(place, rotation_deg=0.0):
+def view(place, rotation_deg=0.0):
     """The ground at a place, seen from straight above."""
-    return seen_from_above(textured(place, 800, 800), 320, rotation_deg)
+    return view_from_above(textured(place, 800, 800), 320, rotation_deg)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,8 @@ def flight(tmp_path_factory):
     for side in ("mapped", "later"):
         (folder / side).mkdir()
     for place in range(PLACES):
-        cv2.imwrite(str(folder / "mapped" / f"{place}.jpg"), seen(place))
-        cv2.imwrite(str(folder / "later" / f"{place}.jpg"), cv2.convertScaleAbs(seen(place, 45), alpha=0.8))
+        cv2.imwrite(str(folder / "mapped" / f"{place}.jpg"), view(place))
+        cv2.imwrite(str(folder / "later" / f"{place}.jpg"), cv2.convertScaleAbs(view(place, 45), alpha=0.8))
         rows.append(f"{place}.jpg,{50 + 0.002 * place:.6f},8,0")
     (folder / "mapped" / "positions.csv").write_text("\n".join(rows) + "\n")
     return folder
@@ -92,19 +92,19 @@ def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
                 ground.match(image)
         for kind in (np.float64, np.uint16):
             with pytest.raises(ImageError, match="of uint8"):
-                ground.match(seen(1).astype(kind))
+                ground.match(view(1).astype(kind))
         for known in ({"heading_deg": "north"}, {"height_m": float("nan")}, {"near": (50.0, 8.0)}, {"t_s": "now"}):
             with pytest.raises(UsageError, match=next(iter(known))):
-                ground.match(seen(1), **known)
+                ground.match(view(1), **known)
     with pytest.raises(UsageError, match="closed"):
-        ground.match(seen(1))
+        ground.match(view(1))
     for wrong in (None, 3):
         with pytest.raises(UsageError, match="path"):
             edgevpr.Map(wrong)
         with pytest.raises(UsageError, match="path"):
             edgevpr.build(tmp_path / "m.gpkg", wrong)
     with edgevpr.Map(valley, fov_deg=60) as ground, pytest.raises(UsageError, match="height_m"):
-        ground.match(seen(1))
+        ground.match(view(1))
     with pytest.raises(SourceError, match="nothing"):
         edgevpr.build(
             tmp_path / "m.gpkg", edgevpr.OrthophotoGrid(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)

@@ -3,7 +3,7 @@
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight
 from pictures import textured
-from walks import map_of
+from walks import make_map
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.techniques import create
@@ -13,7 +13,7 @@ def test_flight_from_pictures_to_a_fix(tmp_path):
     frames = [
         Frame(image=textured(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
     ]
-    place_map, clock = map_of(tmp_path / "m.gpkg", create("cohog", {"w1": 208}), frames), FakeClock()
+    place_map, clock = make_map(tmp_path / "m.gpkg", create("cohog", {"w1": 208}), frames), FakeClock()
     link = FakeLink(clock)
     flight = Flight(place_map, tmp_path / "log", clock, link)
     known, answer, unknown = flight.fly(FakeSource([textured(3), textured(9)], clock))

@@ -19,7 +19,7 @@ from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.judge import AcceptRule, make_accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-USUAL = MatchSettings(candidates=50)
+USUAL_SETTINGS = MatchSettings(candidates=50)
 
 
 def query_meter(clock: FakeClock | None = None) -> QueryMeter:
@@ -28,7 +28,7 @@ def query_meter(clock: FakeClock | None = None) -> QueryMeter:
     return QueryMeter(load_board("rpi-4b"), wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
-def map_of(path: Path, technique: Technique, frames: Iterable[Frame], **encoder) -> Path:
+def make_map(path: Path, technique: Technique, frames: Iterable[Frame], **encoder) -> Path:
     """Make a map of frames; return its path. `encoder` has other parts of a `FrameEncoder`."""
     with PlaceMap.create(path, technique.spec) as place_map:
         build_map(frames, FrameEncoder(technique=technique, **encoder), place_map)
@@ -42,7 +42,7 @@ def walk_over(
     search: SequenceSearch | None = None,
     *,
     clock: FakeClock | None = None,
-    settings: MatchSettings = USUAL,
+    settings: MatchSettings = USUAL_SETTINGS,
     encoder: dict | None = None,
     **more,
 ) -> Recogniser:

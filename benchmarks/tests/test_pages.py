@@ -30,7 +30,7 @@ PAGES = {
 }
 
 
-def loaded(name: str):
+def load_script(name: str):
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -41,13 +41,13 @@ def loaded(name: str):
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in BENCHMARKS.glob("*.py")))
 def test_scripts_can_be_loaded(name):
-    assert loaded(name).__doc__
+    assert load_script(name).__doc__
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_page_matches_its_results(name):
     page = (base.RESULTS / f"{name}.md").read_text("utf-8")
-    assert loaded(PAGES[name]).page(base.read(name)).strip() + "\n" == page
+    assert load_script(PAGES[name]).page(base.read(name)).strip() + "\n" == page
 
 
 def test_thesis_page_matches_its_results():

@@ -18,7 +18,7 @@ PLACES = 8
 
 
 @pytest.fixture(autouse=True)
-def few(monkeypatch):
+def few_suffice(monkeypatch):
     monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES)
     monkeypatch.setattr(calibrate, "count_queries", lambda technique: PLACES)
 
@@ -33,7 +33,7 @@ def flight(tmp_path_factory):
     return folder
 
 
-def built(path, images, *flags):
+def build_map(path, images, *flags):
     return main(
         ["map", "build", str(path), "--images", str(images), "--technique", "cohog", "--param", "w1=208", *flags]
     )
@@ -42,16 +42,16 @@ def built(path, images, *flags):
 @pytest.fixture(scope="module")
 def bare_map(flight, tmp_path_factory):
     path = tmp_path_factory.mktemp("bare") / "m.gpkg"
-    assert built(path, flight / "ref", "--no-calibrate") == 0
+    assert build_map(path, flight / "ref", "--no-calibrate") == 0
     return path
 
 
 @pytest.fixture
-def bare(bare_map, tmp_path):
+def uncalibrated_map(bare_map, tmp_path):
     return shutil.copy(bare_map, tmp_path / "m.gpkg")
 
 
-def calibration_in(path):
+def read_calibration_of(path):
     with PlaceMap.open(path) as place_map:
         text = place_map.calibration
     return None if text is None else read_calibration(text)
@@ -60,20 +60,20 @@ def calibration_in(path):
 @pytest.mark.slow
 def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
-    assert built(path, flight / "ref") == 0
-    assert f"expect: {(found := calibration_in(path)).described()}\n" in capsys.readouterr().out
-    assert built(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
+    assert build_map(path, flight / "ref") == 0
+    assert f"expect: {(found := read_calibration_of(path)).described()}\n" in capsys.readouterr().out
+    assert build_map(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
 
 def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES + 1)
-    assert built(tmp_path / "small.gpkg", flight / "ref") == 0
+    assert build_map(tmp_path / "small.gpkg", flight / "ref") == 0
     said = capsys.readouterr()
     assert (said.out + said.err).count(f"it has {PLACES} places") == 1
     assert "expect:" not in said.out
     monkeypatch.setitem(sys.modules, "edgevpr.mapmaking.calibrate", None)  # as where SciPy is missing
-    assert built(tmp_path / "bare.gpkg", flight / "ref", "--json") == 0
+    assert build_map(tmp_path / "bare.gpkg", flight / "ref", "--json") == 0
     made = json.loads(capsys.readouterr().out)
     assert (made["places"], len(made["not_done"])) == (PLACES, 1)
     assert "SciPy" in made["not_done"][0]
@@ -88,19 +88,19 @@ def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, caps
         (["--images", "FLIGHT/ref", "--positions", "FLIGHT/absent.csv"], 2, "absent.csv"),
     ],
 )
-def test_map_calibrate_refuses_other_pictures(bare, flight, capsys, flags, code, said):
+def test_map_calibrate_refuses_other_pictures(uncalibrated_map, flight, capsys, flags, code, said):
     flags = [each.replace("FLIGHT", str(flight)) for each in flags]
-    assert said in refused(capsys, "map", "calibrate", bare, *flags, code=code)
-    assert calibration_in(bare) is None
+    assert said in refused(capsys, "map", "calibrate", uncalibrated_map, *flags, code=code)
+    assert read_calibration_of(uncalibrated_map) is None
 
 
 @pytest.mark.slow
-def test_shrink_map_keeps_the_calibration_and_map_merge_drops_it(bare, bare_map, flight, tmp_path, capsys):
-    assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
-    shrink_map(bare, tmp_path / "small.gpkg", 4)
-    assert calibration_in(tmp_path / "small.gpkg") == calibration_in(bare)
+def test_shrink_map_keeps_the_calibration_and_map_merge_drops_it(uncalibrated_map, bare_map, flight, tmp_path, capsys):
+    assert main(["map", "calibrate", str(uncalibrated_map), "--images", str(flight / "ref")]) == 0
+    shrink_map(uncalibrated_map, tmp_path / "small.gpkg", 4)
+    assert read_calibration_of(tmp_path / "small.gpkg") == read_calibration_of(uncalibrated_map)
     capsys.readouterr()
     merged = tmp_path / "merged.gpkg"
-    assert main(["map", "merge", str(merged), str(bare), str(bare_map)]) == 0
+    assert main(["map", "merge", str(merged), str(uncalibrated_map), str(bare_map)]) == 0
     assert f"calibrate {merged}" in capsys.readouterr().out
-    assert calibration_in(merged) is None
+    assert read_calibration_of(merged) is None

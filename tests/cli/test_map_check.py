@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 from commands import refused, run_json
-from full_disk import no_file_larger_than
+from full_disk import limit_file_size
 from map_writer import write_sql
 from pictures import textured, write_flight
 
@@ -24,7 +24,7 @@ def flight(tmp_path_factory):
 @pytest.fixture(scope="module")
 def whole_valley(flight, tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "valley.gpkg"
-    assert main(built(path, flight)) == 0
+    assert main(build_command(path, flight)) == 0
     return path
 
 
@@ -33,7 +33,7 @@ def valley(whole_valley, tmp_path):
     return shutil.copy(whole_valley, tmp_path / whole_valley.name)
 
 
-def built(path, flight):
+def build_command(path, flight):
     return ["map", "build", str(path), "--images", str(flight / "images"), "--technique", "cohog", "--param", "w1=208"]
 
 
@@ -96,13 +96,13 @@ def test_map_repair_leaves_a_completely_unreadable_map_unchanged(valley, capsys)
 
 def run_full(arguments, bytes_at_most):
     """Run a command on a disk that takes files of so many bytes at most."""
-    with no_file_larger_than(bytes_at_most):
+    with limit_file_size(bytes_at_most):
         return main(arguments)
 
 
 @pytest.mark.parametrize("bytes_at_most", [1, 5_000, 45_000])
 def test_map_build_leaves_no_empty_map_on_a_full_disk(flight, tmp_path, bytes_at_most, capsys):
-    assert run_full(built(tmp_path / "m.gpkg", flight), bytes_at_most) == 1
+    assert run_full(build_command(tmp_path / "m.gpkg", flight), bytes_at_most) == 1
     assert "Traceback" not in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

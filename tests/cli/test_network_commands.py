@@ -23,14 +23,14 @@ def flight(tmp_path, models):
     return tmp_path
 
 
-def built(flight, *flags):
+def build_map(flight, *flags):
     path = flight / "m.gpkg"
     assert main(["map", "build", str(path), "--images", str(flight / "ref"), *flags]) == 0
     return path
 
 
 def test_match_uses_one_map_in_all_forms(capsys, flight):
-    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    path = build_map(flight, "--technique", "calc", "--param", "model=tiny")
     content = path.read_bytes()
     for form in FORMS:
         capsys.readouterr()
@@ -42,7 +42,7 @@ def test_match_uses_one_map_in_all_forms(capsys, flight):
 
 
 def test_open_recogniser_uses_the_form_of_the_configuration(flight):
-    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    path = build_map(flight, "--technique", "calc", "--param", "model=tiny")
     config = load_config(None, {"map": str(path), "match.form": "1bit"})
     recogniser = open_recogniser(config, load_board("this"))
     assert recogniser.index.rows.shape == (6, 8)
@@ -54,14 +54,14 @@ def test_open_recogniser_uses_the_form_of_the_configuration(flight):
 
 
 def test_match_refuses_a_map_of_other_weights(models, flight, capsys):
-    path = built(flight, "--technique", "calc", "--param", "model=tiny")
+    path = build_map(flight, "--technique", "calc", "--param", "model=tiny")
     write_network(models, "tiny", fault="dynamic batch")
     capsys.readouterr()
     assert "sha256" in refused(capsys, "match", path, "--images", flight / "query", code=1)
 
 
 def test_match_explains_how_to_get_the_network_of_a_map(models, flight, capsys):
-    path = built(flight, "--technique", "tiny")
+    path = build_map(flight, "--technique", "tiny")
     (models / "tiny.yaml").unlink()
     assert main(["match", str(path), "--images", str(flight / "query")]) == 1
     said = capsys.readouterr().err

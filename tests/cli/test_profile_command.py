@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 from commands import refused, run, run_json
-from example_costs import REGIONS, VECTOR, found
+from example_costs import REGIONS, VECTOR, make_accuracy
 from pictures import textured, write_flight
 
 from edgevpr import techniques
@@ -17,13 +17,13 @@ HOG = replace(VECTOR, ram_bytes_per_place=285_794, disk_bytes_per_place=285_768)
 
 
 @pytest.fixture(autouse=True)
-def alone(monkeypatch, tmp_path):
+def no_stored_figures(monkeypatch, tmp_path):
     """Nobody's stored figures."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
 
 
 @pytest.fixture
-def tried(monkeypatch):
+def trials(monkeypatch):
     """What was tried, by trials that take no time."""
     asked = []
 
@@ -38,7 +38,7 @@ def tried(monkeypatch):
     monkeypatch.setattr(trial, "run_trials", answer)
     monkeypatch.setattr(techniques, "list_techniques", lambda: ("cohog", "hog", "seqslam", "calc"))
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
-    table = {label: found(recall) for label, recall in recalls.items()}
+    table = {label: make_accuracy(recall) for label, recall in recalls.items()}
     monkeypatch.setattr(choose, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return asked
 
@@ -58,11 +58,11 @@ def test_profile_tries_the_real_techniques(capsys, monkeypatch):
     assert found["recommended"] == "cohog"
 
 
-def test_profile_recommends_first_and_lists_every_technique(capsys, tried):
+def test_profile_recommends_first_and_lists_every_technique(capsys, trials):
     assert run("profile", "--board", "rpi-4b", "--places", 20) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("Recommended: cohog: ")
-    assert tried == ["cohog", "hog", "hog 8bit", "hog 1bit", "seqslam", "calc", "calc 8bit", "calc 1bit"]
+    assert trials == ["cohog", "hog", "hog 8bit", "hog 1bit", "seqslam", "calc", "calc 8bit", "calc 1bit"]
     assert {"cohog", "hog 1bit", "seqslam", "calc"} <= {line.split("  ")[0] for line in said}
     assert max(map(len, said)) <= 120
 
@@ -72,14 +72,14 @@ def test_profile_list_names_every_board_and_this_machine(capsys):
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["this", *list_boards()]
 
 
-def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):
+def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, trials):
     path = tmp_path / "valley.gpkg"
     write_flight(tmp_path / "flight", [textured(number) for number in range(3)])
     assert run("map", "build", path, "--images", tmp_path / "flight", "--technique", "hog") == 0
     found = run_json(capsys, "profile", "--map", path)
     assert found["plan"]["places"] == 3
     assert found["recommended"] == "hog"
-    assert tried == ["hog", "hog 8bit", "hog 1bit"]
+    assert trials == ["hog", "hog 8bit", "hog 1bit"]
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):
         (["--places", "50", "--board", "rpi4"], 2, "There is no board `rpi4`"),
     ],
 )
-def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, tried, argv, code, sentence):
+def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, trials, argv, code, sentence):
     monkeypatch.chdir(tmp_path)
     assert sentence in refused(capsys, "profile", *argv, code=code)
-    assert not tried, "said before the measuring"
+    assert not trials, "said before the measuring"

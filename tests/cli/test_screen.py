@@ -11,10 +11,10 @@ from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
 from edgevpr.core.text import escape_unprintable, redact_passwords, sanitize
 
-REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
+RED_ESCAPE_NAME = "\x1b[31m.jpg"  # a name that would make all that follows red
 
 
-def said(capfd, *words):
+def capture_output(capfd, *words):
     """The exit code of a command, and all that it and its libraries print."""
     try:
         code = main([str(word) for word in words])
@@ -71,13 +71,13 @@ def test_main_escapes_names_of_images(tmp_path, capfd):
     for number, folder in enumerate(("ref", "query")):
         (tmp_path / folder).mkdir()
         picture = cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes()
-        (tmp_path / folder / REDDENING).write_bytes(picture)
+        (tmp_path / folder / RED_ESCAPE_NAME).write_bytes(picture)
         (tmp_path / folder / f"{number}\x1b[0m.jpg").write_bytes(b"no image")
-    code, *built = said(
+    code, *built = capture_output(
         capfd, "map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref", "--technique", "cohog"
     )
     assert code == 1
-    _, out, err = said(capfd, "match", tmp_path / "m.gpkg", "--images", tmp_path / "query")
+    _, out, err = capture_output(capfd, "match", tmp_path / "m.gpkg", "--images", tmp_path / "query")
     assert "1\\x1b[0m.jpg is not an image" in err
     assert out.count("\\x1b[31m.jpg") == 2
     assert "\x1b" not in "".join([*built, out, err])
@@ -86,16 +86,16 @@ def test_main_escapes_names_of_images(tmp_path, capfd):
 @pytest.mark.slow
 def test_main_prints_no_password(tmp_path, capfd):
     (tmp_path / "c.yaml").write_text("source: {uri: 'http://pilot:secret@127.0.0.1:9/cam'}\n")
-    _, *checked = said(capfd, "check", "--config", tmp_path / "c.yaml")
+    _, *checked = capture_output(capfd, "check", "--config", tmp_path / "c.yaml")
     assert "http://pilot:***@127.0.0.1:9/cam" in checked[0]
     build = "map", "build", tmp_path / "m.gpkg", "--images", "rtsp://pilot:secret@127.0.0.1/cam"
-    code, *refused = said(capfd, *build)
+    code, *refused = capture_output(capfd, *build)
     assert (code, "rtsp://pilot:***@127.0.0.1/cam is live" in refused[1]) == (1, True)
     assert "secret" not in "".join([*checked, *refused])
 
 
 def test_main_escapes_a_wrong_flag(capfd):
-    code, _, err = said(capfd, "match", "m.gpkg", "--images", "x", "\x1b[31m")
+    code, _, err = capture_output(capfd, "match", "m.gpkg", "--images", "x", "\x1b[31m")
     assert code == 2
     assert "\\x1b[31m" in err
     assert "\x1b" not in err

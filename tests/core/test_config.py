@@ -12,7 +12,7 @@ from edgevpr.core.yamlfile import read_yaml
 SHIPPED = Path(__file__).parents[2] / "deploy" / "config.yaml"
 
 
-def explanations() -> dict[str, str]:
+def read_comments() -> dict[str, str]:
     """The comment above each key of the shipped file, by the key's dotted name; keys in a row share one."""
     found, comment, section, is_new = {}, "", "", True
     for line in SHIPPED.read_text("utf-8").splitlines():
@@ -26,11 +26,11 @@ def explanations() -> dict[str, str]:
 
 def test_config_file_holds_the_default_of_every_key():
     assert build(Config, read_yaml(SHIPPED), "the shipped file") == Config()
-    assert {key.name.removesuffix(".gps").removesuffix(".no_gps") for key in list_keys()} <= explanations().keys()
+    assert {key.name.removesuffix(".gps").removesuffix(".no_gps") for key in list_keys()} <= read_comments().keys()
 
 
 def test_config_file_documents_the_limits_of_every_key():
-    texts, unsaid = explanations(), []
+    texts, unsaid = read_comments(), []
     for key in (key for key in list_keys() if key.limits):
         limits = " to ".join(f"{limit:.12g}" for limit in key.limits)
         if limits not in (texts.get(key.name) or texts[key.name.rpartition(".")[0]]):

@@ -6,18 +6,18 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.yamlfile import MAX_FILE_BYTES, read_yaml
 
-LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+ALIAS_BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{after}: &{after} [{', '.join([f'*{before}'] * 10)}]\n"
     for before, after in zip("abcdefgh", "bcdefghi", strict=True)
 )
-MERGES = "a: &a {x0: 1}\n" + "".join(
+MERGE_BOMB = "a: &a {x0: 1}\n" + "".join(
     f"{after}: &{after}\n" + f"  <<: [{', '.join([f'*{before}'] * 10)}]\n"
     for before, after in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
 
 @pytest.fixture
-def refused(tmp_path):
+def read_refusal(tmp_path):
     """The sentence with which a file is refused."""
 
     def refuse(content: str | bytes, read=read_yaml) -> str:
@@ -34,21 +34,21 @@ def refused(tmp_path):
     return refuse
 
 
-def test_read_yaml_names_both_lines_of_a_duplicate_key(refused):
-    said = refused("source: {uri: a}\nmap: m.gpkg\nsource: {uri: b}\n")
+def test_read_yaml_names_both_lines_of_a_duplicate_key(read_refusal):
+    said = read_refusal("source: {uri: a}\nmap: m.gpkg\nsource: {uri: b}\n")
     assert "config.yaml, line 3 is not valid YAML (the key `source` is already in line 1)" in said
-    assert "line 2" in refused("source:\n  {uri: a, rate_hz: 1, uri: b}\n")
-    assert "line 4" in refused('match:\n  min_score: 0.5\n  form: float\n  "min_score": 0.6\n')
+    assert "line 2" in read_refusal("source:\n  {uri: a, rate_hz: 1, uri: b}\n")
+    assert "line 4" in read_refusal('match:\n  min_score: 0.5\n  form: float\n  "min_score": 0.6\n')
 
 
-@pytest.mark.parametrize("content", [LAUGHS, MERGES, "a: &a {b: *a}\n"])
-def test_read_yaml_refuses_aliases(content, refused):
-    assert "alias `*a`" in refused(content)
+@pytest.mark.parametrize("content", [ALIAS_BOMB, MERGE_BOMB, "a: &a {b: *a}\n"])
+def test_read_yaml_refuses_aliases(content, read_refusal):
+    assert "alias `*a`" in read_refusal(content)
 
 
 @pytest.mark.parametrize("level", ["[", "{a: ", "- ", "? "])
-def test_read_yaml_refuses_deep_nesting(level, refused):
-    assert "is not valid YAML" in refused(level * (MAX_FILE_BYTES // len(level) - 1))
+def test_read_yaml_refuses_deep_nesting(level, read_refusal):
+    assert "is not valid YAML" in read_refusal(level * (MAX_FILE_BYTES // len(level) - 1))
 
 
 @pytest.mark.parametrize(
@@ -63,8 +63,8 @@ def test_read_yaml_refuses_deep_nesting(level, refused):
         (".nan", "`source.rate_hz` is nan, but must be between"),
     ],
 )
-def test_load_config_refuses_numbers_with_hundreds_of_digits(number, says, refused):
-    assert says in refused(f"source: {{rate_hz: {number}}}\n", load_config)
+def test_load_config_refuses_numbers_with_hundreds_of_digits(number, says, read_refusal):
+    assert says in read_refusal(f"source: {{rate_hz: {number}}}\n", load_config)
 
 
 @pytest.mark.parametrize(
@@ -78,12 +78,12 @@ def test_load_config_refuses_numbers_with_hundreds_of_digits(number, says, refus
         ("m.gpkg\n? " + "k" * 50_000 + "\n: 1", "key `kkkk"),
     ],
 )
-def test_load_config_refuses_characters_that_no_file_name_can_have(text, says, refused):
-    assert says in refused(f"map: {text}\n", load_config)
+def test_load_config_refuses_characters_that_no_file_name_can_have(text, says, read_refusal):
+    assert says in read_refusal(f"map: {text}\n", load_config)
 
 
-def test_read_yaml_refuses_a_large_file(refused):
-    assert "0.1 MB" in refused("# " + "x" * MAX_FILE_BYTES)
+def test_read_yaml_refuses_a_large_file(read_refusal):
+    assert "0.1 MB" in read_refusal("# " + "x" * MAX_FILE_BYTES)
 
 
 def test_read_yaml_returns_a_copy(tmp_path):

@@ -9,7 +9,7 @@ from edgevpr.frames.source import open_source
 
 
 @pytest.fixture
-def opened(monkeypatch):
+def open_live_source(monkeypatch):
     """open_source for live sources, with a short read time-out; closed at the end."""
     monkeypatch.setattr(streams, "READ_TIMEOUT_S", 0.7)
     sources = []

@@ -10,7 +10,7 @@ def picture(height: int = 48, width: int = 64) -> np.ndarray:
     return cv2.GaussianBlur(noise, (0, 0), 1.0)
 
 
-def encoded(extension: str, image: np.ndarray, *options: int) -> bytes:
+def encode_image(extension: str, image: np.ndarray, *options: int) -> bytes:
     return cv2.imencode(extension, image, options)[1].tobytes()
 
 

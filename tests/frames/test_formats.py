@@ -23,7 +23,7 @@ from edgevpr.frames.stereo import StereoCheck
 SIZE_PX = (256, 64)
 RAMP = np.repeat(np.arange(256, dtype=np.uint8)[None, :], SIZE_PX[1], 0)
 SCENE = cv2.GaussianBlur(np.random.default_rng(3).normal(128, 400, (240, 320)), (0, 0), 3)
-CLOSE_TO_FULL_WHITE = 5  # levels: FFmpeg's fast conversion of yuv420p, which is as exact as flights and maps ever were
+MAX_LEVEL_ERROR = 5  # levels: FFmpeg's fast conversion of yuv420p, which is as exact as flights and maps ever were
 
 
 def write_video(path: Path, pictures, pixel_format: str, codec: str = "ffv1", **settings) -> Path:
@@ -48,13 +48,13 @@ def read_frames(path: Path) -> list[np.ndarray]:
     return [frame.image for frame in read_to_end(open_source(str(path), live=False), pytest.fail) if frame]
 
 
-def as_counts(grey: np.ndarray, counts_per_level: float = 4, black: int = 7600) -> np.ndarray:
+def to_counts(grey: np.ndarray, counts_per_level: float = 4, black: int = 7600) -> np.ndarray:
     """Turn a picture into what a thermal camera gives: a thousand counts somewhere in the middle of 16 bits."""
     return (black + counts_per_level * np.clip(grey, 0, 255)).astype(np.uint16)
 
 
 def thermal_flight() -> list[np.ndarray]:
-    return [as_counts(np.roll(SCENE, 8 * step, 1)) for step in range(12)]
+    return [to_counts(np.roll(SCENE, 8 * step, 1)) for step in range(12)]
 
 
 def decode_file(path: Path) -> tuple[VideoDecoder, list[av.VideoFrame]]:
@@ -89,7 +89,7 @@ def test_make_thumbnail_is_safe_in_two_threads(pixel_format, tmp_path):
 @pytest.mark.parametrize(
     ("pixel_format", "codec", "color_range", "levels"),
     [
-        ("yuv420p", "libx264", 1, CLOSE_TO_FULL_WHITE),
+        ("yuv420p", "libx264", 1, MAX_LEVEL_ERROR),
         ("yuv420p", "libx264", 2, 2),
         ("yuv420p", "libx265", 2, 2),
         ("yuv422p", "libx264", 1, 2),
@@ -127,7 +127,7 @@ def test_read_frames_gives_equal_counts_from_a_folder_and_a_video(tmp_path):
 
 
 def test_video_of_12_bits_of_grey_shows_its_own_range_with_square_pixels(tmp_path):
-    counts = as_counts(SCENE, 32, 16_000)  # 16 times the counts of 12 bits
+    counts = to_counts(SCENE, 32, 16_000)  # 16 times the counts of 12 bits
     video = [av.VideoFrame.from_ndarray(counts, "gray16le").reformat(format="gray12le")]
     settings = {"options": {"x265-params": "log-level=none:lossless=1"}, "sample_aspect_ratio": Fraction(3, 2)}
     (image,) = read_frames(write_video(tmp_path / "a.mkv", video, "gray12le", "libx265", **settings))
@@ -136,7 +136,7 @@ def test_video_of_12_bits_of_grey_shows_its_own_range_with_square_pixels(tmp_pat
 
 
 def test_depth_range_is_common_to_all_channels_of_a_16_bit_colour_image(tmp_path):
-    cv2.imwrite(str(tmp_path / "colour.png"), cv2.merge([as_counts(SCENE), as_counts(SCENE), as_counts(SCENE, 2)]))
+    cv2.imwrite(str(tmp_path / "colour.png"), cv2.merge([to_counts(SCENE), to_counts(SCENE), to_counts(SCENE, 2)]))
     colour = read_image(tmp_path / "colour.png")
     assert (colour.dtype, colour.shape) == (np.uint8, (*SCENE.shape, 3))
     assert colour[..., 0].mean() > colour[..., 2].mean() + 20
@@ -159,7 +159,7 @@ def test_depth_range_shows_an_image_outside_the_range_with_its_own_range():
     first, *_ = (depth.to_8_bits(counts) for counts in flight)
     moved = depth.to_8_bits(flight[0] + np.uint16(3000))  # as after the calibration of a thermal camera's shutter
     assert np.abs(first.astype(int) - moved).mean() < 12
-    narrow = depth.to_8_bits(as_counts(SCENE, 0.5))
+    narrow = depth.to_8_bits(to_counts(SCENE, 0.5))
     assert narrow.std() > 0.8 * first.std()
 
 

@@ -12,7 +12,7 @@ STEP_S = 0.05
 START_S = 1000.0
 
 
-def feed(time, taken_s, came_s, *, rate=1.0, sizes=None, stamp_s=100.0):
+def feed_times(time, taken_s, came_s, *, rate=1.0, sizes=None, stamp_s=100.0):
     """Let pictures arrive that were taken and came at these times; their stamps run `rate` times as fast as the clock.
     Returns ages and standard deviations on arrival, NaN where they are unknown."""
     sizes = np.full(len(taken_s), 9000) if sizes is None else sizes
@@ -29,7 +29,7 @@ def feed(time, taken_s, came_s, *, rate=1.0, sizes=None, stamp_s=100.0):
 def feed_delayed(time, delays_s, **more):
     """`feed` with a picture every 50 ms, each delayed by so much."""
     taken_s = STEP_S * np.arange(len(delays_s))
-    return feed(time, taken_s, taken_s + delays_s, **more)[0]
+    return feed_times(time, taken_s, taken_s + delays_s, **more)[0]
 
 
 def draw_sizes(pictures, rng, key_every=10, key_factor=2.2):
@@ -61,7 +61,7 @@ def test_stamped_time_corrects_timestamps_of_another_rate(rate, from_s, rate_hz)
     sizes = draw_sizes(len(taken_s), rng)
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))
     time = StampedTime()
-    ages_s, sds_s = feed(time, taken_s, came_s, rate=rate, sizes=sizes)
+    ages_s, sds_s = feed_times(time, taken_s, came_s, rate=rate, sizes=sizes)
     later = taken_s >= from_s
     errors_s = (ages_s - (came_s - taken_s))[later]
     assert not np.isnan(ages_s[later]).any()
@@ -85,7 +85,7 @@ def test_stamped_time_counts_congestion_as_age_and_not_as_clock_drift(slow, last
         taken_s, sizes, lambda t_s: (slow if 30 <= t_s < 30 + lasts_s else 3) * sent_bytes_per_s, rng
     )
     time = StampedTime()
-    ages_s, _ = feed(time, taken_s, came_s, sizes=sizes)
+    ages_s, _ = feed_times(time, taken_s, came_s, sizes=sizes)
     is_known = ~np.isnan(ages_s)
     assert (came_s - taken_s).max() > 2
     assert np.abs(ages_s - (came_s - taken_s))[is_known].max() < 0.05
@@ -101,7 +101,7 @@ def test_stamped_time_does_not_take_changing_congestion_for_clock_drift(seed):
     sizes = draw_sizes(len(taken_s), rng, key_every=25, key_factor=1.0 + seed)
     capacities = 25 * sizes.mean() * np.where(np.arange(1000) < 2, 3, rng.uniform(0.3, 1.3, 1000))
     came_s = simulate_link(taken_s, sizes, lambda t_s: capacities[int(t_s / 4)], rng)
-    ages_s, _ = feed(StampedTime(), taken_s, came_s, sizes=sizes)
+    ages_s, _ = feed_times(StampedTime(), taken_s, came_s, sizes=sizes)
     assert np.nanmin(ages_s - (came_s - taken_s)) > -0.1, "none is said to be younger than it is"
 
 
@@ -185,7 +185,7 @@ def test_age_is_less_certain_with_counted_timestamps(rate, least_sd_s):
     taken_s = np.arange(20 * 25) / 25
     came_s = taken_s + rng.uniform(0, 0.002, len(taken_s))
     came_s[-1] += 1.0
-    ages_s, sds_s = feed(StampedTime(), taken_s, came_s, rate=rate, sizes=draw_sizes(len(taken_s), rng))
+    ages_s, sds_s = feed_times(StampedTime(), taken_s, came_s, rate=rate, sizes=draw_sizes(len(taken_s), rng))
     assert ages_s[-1] == pytest.approx(1.0, abs=0.02)
     assert sds_s[-1] == pytest.approx(least_sd_s, rel=0.05)
     assert sds_s[-2] == pytest.approx(FRAME_TIME_SD_S, rel=0.05)

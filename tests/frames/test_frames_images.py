@@ -15,11 +15,11 @@ from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import MAX_PIXELS, list_images, read_image
 
-THUMBNAIL = photographs.encoded(".jpg", photographs.picture(24, 32))
+THUMBNAIL = photographs.encode_image(".jpg", photographs.picture(24, 32))
 JPEGS = {
-    "baseline": photographs.encoded(".jpg", photographs.picture()),
-    "progressive": photographs.encoded(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
-    "restart markers": photographs.encoded(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
+    "baseline": photographs.encode_image(".jpg", photographs.picture()),
+    "progressive": photographs.encode_image(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restart markers": photographs.encode_image(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
 }
 JPEGS["thumbnail"] = photographs.with_app1(JPEGS["baseline"], b"not even TIFF" + THUMBNAIL)
 
@@ -29,7 +29,7 @@ def write(path, data):
     return path
 
 
-def complaint(path):
+def read_refusal(path):
     with pytest.raises(ImageError) as refusal:
         read_image(path)
     sentence = str(refusal.value)
@@ -42,7 +42,7 @@ def complaint(path):
 def test_read_image_gives_bgr_of_each_format(extension, tmp_path):
     blue = np.zeros((20, 30, 3), np.uint8)
     blue[..., 0] = 200
-    image = read_image(write(tmp_path / f"blue{extension}", photographs.encoded(extension, blue)))
+    image = read_image(write(tmp_path / f"blue{extension}", photographs.encode_image(extension, blue)))
     assert image.dtype == np.uint8
     assert image.shape == (20, 30, 3)
     np.testing.assert_allclose(image.mean((0, 1)), (200, 0, 0), atol=3)
@@ -56,7 +56,7 @@ def test_read_image_allows_bytes_behind_the_end_of_a_jpeg(kind, tmp_path):
 
 
 WHOLE = [(".jpg", data) for data in JPEGS.values()] + [
-    (extension, photographs.encoded(extension, photographs.picture()))
+    (extension, photographs.encode_image(extension, photographs.picture()))
     for extension in (".png", ".tif", ".bmp", ".webp", ".ppm")
 ]
 
@@ -64,7 +64,7 @@ WHOLE = [(".jpg", data) for data in JPEGS.values()] + [
 @pytest.mark.parametrize(("extension", "whole"), WHOLE)
 def test_read_image_refuses_a_truncated_image(extension, whole, tmp_path, capfd):
     for share in (0.02, 0.2, 0.5, 0.9, 0.995):
-        sentence = complaint(write(tmp_path / f"cut{extension}", whole[: int(share * len(whole))]))
+        sentence = read_refusal(write(tmp_path / f"cut{extension}", whole[: int(share * len(whole))]))
         assert "truncated" in sentence or extension not in (".jpg", ".png")
     assert capfd.readouterr().err == ""
 
@@ -97,7 +97,7 @@ def wide_jpeg():
     return BASELINE[:at] + struct.pack(">HH", 65_000, 65_000) + BASELINE[at + 4 :]
 
 
-TOO_MANY = "102 megapixels"
+TOO_MANY_PIXELS = "102 megapixels"
 
 
 @pytest.mark.parametrize(
@@ -110,31 +110,31 @@ TOO_MANY = "102 megapixels"
         ("empty.jpg", b"", "is empty"),
         ("text.jpg", b"To whom it may concern: this is no photograph.", "is not an image"),
         ("video.png", b"\x00\x00\x00\x20ftypisom" + bytes(100), "is not an image"),
-        ("deep.tif", photographs.encoded(".tif", np.zeros((20, 20), np.int16)), "8 or 16 bits"),
-        ("real.tif", photographs.encoded(".tif", np.zeros((20, 20, 3), np.float32)), "8 or 16 bits"),
-        ("flat.png", photographs.encoded(".png", np.zeros((15, 40), np.uint8)), "40x15 pixels"),
-        ("thin.png", photographs.encoded(".png", np.zeros((40, 15), np.uint8)), "15x40 pixels"),
-        ("wide.png", png(20_000, 20_000), TOO_MANY),
-        ("wide.jpg", wide_jpeg(), TOO_MANY),
-        ("wide.tif", tiff(t256=30_000, t257=30_000), TOO_MANY),
-        ("tile.tif", tiff(t256=20, t257=20, t322=30_000, t323=30_000), TOO_MANY),
-        ("wide.bmp", b"BM" + bytes(12) + struct.pack("<Iii", 40, 60_000, -60_000) + bytes(40), TOO_MANY),
-        ("wide.webp", b"RIFF\x00\x00\x00\x00WEBPVP8X" + bytes(8) + b"\xff\xff\x00\xff\xff\x00", TOO_MANY),
-        ("wide.pgm", b"P5\n60000 60000\n255\n" + bytes(100), TOO_MANY),
+        ("deep.tif", photographs.encode_image(".tif", np.zeros((20, 20), np.int16)), "8 or 16 bits"),
+        ("real.tif", photographs.encode_image(".tif", np.zeros((20, 20, 3), np.float32)), "8 or 16 bits"),
+        ("flat.png", photographs.encode_image(".png", np.zeros((15, 40), np.uint8)), "40x15 pixels"),
+        ("thin.png", photographs.encode_image(".png", np.zeros((40, 15), np.uint8)), "15x40 pixels"),
+        ("wide.png", png(20_000, 20_000), TOO_MANY_PIXELS),
+        ("wide.jpg", wide_jpeg(), TOO_MANY_PIXELS),
+        ("wide.tif", tiff(t256=30_000, t257=30_000), TOO_MANY_PIXELS),
+        ("tile.tif", tiff(t256=20, t257=20, t322=30_000, t323=30_000), TOO_MANY_PIXELS),
+        ("wide.bmp", b"BM" + bytes(12) + struct.pack("<Iii", 40, 60_000, -60_000) + bytes(40), TOO_MANY_PIXELS),
+        ("wide.webp", b"RIFF\x00\x00\x00\x00WEBPVP8X" + bytes(8) + b"\xff\xff\x00\xff\xff\x00", TOO_MANY_PIXELS),
+        ("wide.pgm", b"P5\n60000 60000\n255\n" + bytes(100), TOO_MANY_PIXELS),
     ],
 )
 def test_read_image_refuses_damaged_too_large_and_other_files(name, content, what, tmp_path, capfd):
-    assert what in complaint(write(tmp_path / name, content))
+    assert what in read_refusal(write(tmp_path / name, content))
     assert capfd.readouterr().err == ""
 
 
 def test_read_image_refuses_pipes_and_devices_at_once(tmp_path):
-    complaint(tmp_path / "nothing.jpg")
+    read_refusal(tmp_path / "nothing.jpg")
     (tmp_path / "folder.jpg").mkdir()
-    assert "a directory" in complaint(tmp_path / "folder.jpg")
+    assert "a directory" in read_refusal(tmp_path / "folder.jpg")
     os.mkfifo(tmp_path / "a.jpg")
-    assert "pipe" in complaint(tmp_path / "a.jpg")
-    assert "device" in complaint("/dev/zero")
+    assert "pipe" in read_refusal(tmp_path / "a.jpg")
+    assert "device" in read_refusal("/dev/zero")
 
 
 def test_list_images_sorts_as_a_person_counts(tmp_path):
@@ -169,7 +169,7 @@ def whole_files(folder):
     yield photo, 4 + int.from_bytes(photo[4:6], "big")
     yield photographs.with_app1(photo, xmp), 100
     for extension in (".jpg", ".png", ".tif", ".bmp", ".webp", ".ppm"):
-        yield photographs.encoded(extension, photographs.picture()), 64
+        yield photographs.encode_image(extension, photographs.picture()), 64
 
 
 @pytest.mark.slow

@@ -81,7 +81,7 @@ def film_by_rtsp(film, port):
     return lambda: (stop(), camera.close())
 
 
-def camera_of(kind, film, tmp_path):
+def make_camera(kind, film, tmp_path):
     """The address of a camera, and a function that switches it on and returns the one that switches it off."""
     port = free_port()
     if kind == "http":
@@ -96,10 +96,10 @@ def camera_of(kind, film, tmp_path):
 
 @pytest.mark.network
 @pytest.mark.parametrize("kind", ["udp", "http", "rtsp", "sdp"])
-def test_lost_stream_is_reported_and_reopened(kind, film, opened, tmp_path):
-    uri, switch_on = camera_of(kind, film, tmp_path)
+def test_lost_stream_is_reported_and_reopened(kind, film, open_live_source, tmp_path):
+    uri, switch_on = make_camera(kind, film, tmp_path)
     switch_off = switch_on()
-    source = opened(uri)
+    source = open_live_source(uri)
     frame = next_frame(source)
     assert frame.image.shape == (HEIGHT, WIDTH, 3)
     assert frame.image.std() > 20  # the test picture, not a grey area
@@ -116,10 +116,10 @@ def test_lost_stream_is_reported_and_reopened(kind, film, opened, tmp_path):
 
 
 @pytest.mark.network
-def test_missing_stream_at_the_start_is_awaited_silently(opened, capfd):
+def test_missing_stream_at_the_start_is_awaited_silently(open_live_source, capfd):
     with socket.socket() as closed:  # bound but not listening: every connection is refused
         closed.bind(("127.0.0.1", 0))
-        source = opened(f"tcp://127.0.0.1:{closed.getsockname()[1]}")
+        source = open_live_source(f"tcp://127.0.0.1:{closed.getsockname()[1]}")
         wait_until(lambda: source.state == "connection refused, reopening in 0.5 s")
         wait_until(lambda: source.state == "connection refused, reopening in 1 s")
         assert source.read(0.01) is None
@@ -127,7 +127,7 @@ def test_missing_stream_at_the_start_is_awaited_silently(opened, capfd):
     assert capfd.readouterr().err == ""
 
 
-def shot(number, t_mono_s=None):
+def make_shot(number, t_mono_s=None):
     picture = np.random.default_rng(number).integers(0, 255, (48, 64), np.uint8)
     t_mono_s = time.monotonic() if t_mono_s is None else t_mono_s
     return Shot(t_mono_s=t_mono_s, thumbnail=picture, convert=lambda: picture)
@@ -162,7 +162,7 @@ class Camera:
         self.is_released.set()
 
 
-def paced(given, rate_hz=50):
+def yield_paced(given, rate_hz=50):
     for each in given:
         time.sleep(1 / rate_hz)
         yield each
@@ -193,11 +193,11 @@ def live():
 
 def test_read_gives_the_newest_frame_and_counts_the_others(live):
     clock = FakeClock()
-    source = live(Camera(shot(each, 1000.0) for each in range(5)), clock=clock)
+    source = live(Camera(make_shot(each, 1000.0) for each in range(5)), clock=clock)
     wait_until(lambda: source.dropped == 4)
     clock.now_s += 1.5
     frame = next_frame(source)
-    assert (frame.image == shot(4).convert()).all()
+    assert (frame.image == make_shot(4).convert()).all()
     assert (frame.name, frame.t_mono_s) == ("frame 000004 t=0.000 s", 1000.0)
     assert source.read(0) is None
     wait_until(lambda: source.latency_s == 1.5)  # it grows while no newer picture comes
@@ -209,12 +209,12 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
     [
         ([], Condition.LOST, "lost: no new picture"),
         (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: no picture is complete"),
-        ((shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture again and again"),
+        ((make_shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture again and again"),
     ],
 )
 def test_source_without_new_images_is_reported_and_reopened(given, condition, text, live):
-    first = Camera(paced(itertools.chain(map(shot, range(5)), given)))
-    source = live(first, Camera(paced(map(shot, itertools.count(100)))))
+    first = Camera(yield_paced(itertools.chain(map(make_shot, range(5)), given)))
+    source = live(first, Camera(yield_paced(map(make_shot, itertools.count(100)))))
     wait_until(lambda: source.read(0.1) is None and source.condition is condition)
     assert source.state.startswith(text)
     assert not first.is_released.is_set() or condition is Condition.LOST
@@ -225,15 +225,15 @@ def test_source_without_new_images_is_reported_and_reopened(given, condition, te
 
 @pytest.mark.slow
 def test_image_cached_by_the_server_is_not_new_after_a_loss(live):
-    kept = [shot(1), shot(2), shot(3)]
-    source = live(Camera(kept), Camera(itertools.chain(paced([kept[-1]] * 30), map(shot, range(50, 52)))))
+    kept = [make_shot(1), make_shot(2), make_shot(3)]
+    source = live(Camera(kept), Camera(itertools.chain(yield_paced([kept[-1]] * 30), map(make_shot, range(50, 52)))))
     wait_until(lambda: source.refused["frozen"] >= 30)
     assert source.read(0.0) is None or source.refused["frozen"] == 30
     wait_until(lambda: source.read(0.1))
 
 
 def test_image_older_than_the_previous_one_is_refused(live):
-    source = live(Camera([shot(1, 998.1), shot(2, 998.0)]), clock=FakeClock())
+    source = live(Camera([make_shot(1, 998.1), make_shot(2, 998.0)]), clock=FakeClock())
     assert next_frame(source).t_mono_s == 998.1
     wait_until(lambda: source.refused["late"] == 1)
     assert source.latency_s == pytest.approx(1.9)
@@ -244,10 +244,10 @@ def test_image_older_than_the_previous_one_is_refused(live):
 def test_hanging_call_is_abandoned_without_blocking(step, monkeypatch, live):
     monkeypatch.setattr(live_module, "_OPENING_TIMEOUT_S", 1.0)
     monkeypatch.setattr(liveness, "_UNKNOWN_RATE_TIMEOUT_S", 1.0)
-    shots = map(shot, range(3)) if step == "release" else map(shot, itertools.count())
-    hanging = Camera(itertools.chain(paced(shots), [None]), step)
+    shots = map(make_shot, range(3)) if step == "release" else map(make_shot, itertools.count())
+    hanging = Camera(itertools.chain(yield_paced(shots), [None]), step)
     hanging.is_cancelled.set()  # it is lost, rather than silent
-    source = live(hanging, Camera(paced(map(shot, itertools.count(1000)))))
+    source = live(hanging, Camera(yield_paced(map(make_shot, itertools.count(1000)))))
     wait_until(lambda: source.read(0.1) is None and source.condition is Condition.LOST)
     wait_until(lambda: source.read(0.1))
     assert source.condition is Condition.RUNNING
@@ -276,8 +276,8 @@ def test_driver_error_counts_as_a_loss_with_its_message():
 
 
 def test_image_that_cannot_be_converted_is_skipped(live):
-    broken = replace(shot(1), convert=lambda: 1 / 0)
-    assert next_frame(live(Camera(paced([broken, *map(shot, range(2, 20))], 20))))
+    broken = replace(make_shot(1), convert=lambda: 1 / 0)
+    assert next_frame(live(Camera(yield_paced([broken, *map(make_shot, range(2, 20))], 20))))
 
 
 def test_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch, live):

@@ -9,11 +9,11 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, find_positions, parse_time, read_positions, read_track, write_positions
 
 HEADER = "file,split,lat,lon,alt,rel_alt,yaw_deg,time\n"
-FIRST = "0000.jpg,ref,46.84260708,-91.99455989,198.309,39.8,46.0,2016:06:23 16:31:59\n"
+FIRST_ROW = "0000.jpg,ref,46.84260708,-91.99455989,198.309,39.8,46.0,2016:06:23 16:31:59\n"
 
 
 @pytest.fixture
-def written(tmp_path):
+def write_table(tmp_path):
     def write(text, encoding="utf-8"):
         (tmp_path / "positions.csv").write_bytes(text.encode(encoding))
         return tmp_path / "positions.csv"
@@ -25,7 +25,7 @@ def written(tmp_path):
     ("text", "tags"),
     [
         (
-            HEADER + FIRST,
+            HEADER + FIRST_ROW,
             {
                 "0000.jpg": GeoTag(
                     position=Position(46.84260708, -91.99455989, 198.309),
@@ -52,8 +52,8 @@ def written(tmp_path):
         ),
     ],
 )
-def test_read_positions(text, tags, written):
-    assert read_positions(written(text, "utf-8-sig")) == tags
+def test_read_positions(text, tags, write_table):
+    assert read_positions(write_table(text, "utf-8-sig")) == tags
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,8 @@ def test_parse_time_refuses(text):
         ("0000.jpg,ref,46,2,,,,", "`file` is `0000.jpg`, but must be a name that no earlier line has"),
     ],
 )
-def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, written):
-    path = written(HEADER + FIRST + row + "\n")
+def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, write_table):
+    path = write_table(HEADER + FIRST_ROW + row + "\n")
     with pytest.raises(UsageError) as refusal:
         read_positions(path)
     assert str(refusal.value).startswith(str(path))
@@ -117,17 +117,17 @@ def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, writ
         ("file,lat,lon,rel_alt,rel_alt\n", "rel_alt"),
     ],
 )
-def test_read_positions_names_a_missing_or_duplicate_column(text, column, written):
+def test_read_positions_names_a_missing_or_duplicate_column(text, column, write_table):
     with pytest.raises(UsageError, match=f"line 1.*`{column}`"):
-        read_positions(written(text))
-    assert read_positions(written("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
+        read_positions(write_table(text))
+    assert read_positions(write_table("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
 
 
-def test_read_positions_refuses_binary_files(written, tmp_path):
+def test_read_positions_refuses_binary_files(write_table, tmp_path):
     with pytest.raises(UsageError, match=r"nothing\.csv"):
         read_positions(tmp_path / "nothing.csv")
     with pytest.raises(UsageError, match="text file"):
-        read_positions(written("file,lat,lon\nö.jpg,1,2\n", "latin-1"))
+        read_positions(write_table("file,lat,lon\nö.jpg,1,2\n", "latin-1"))
     os.mkfifo(tmp_path / "pipe.csv")
     with pytest.raises(UsageError, match="pipe"):
         read_positions(tmp_path / "pipe.csv")
@@ -154,9 +154,9 @@ def test_write_positions_is_read_as_the_same(tmp_path):
 
 
 @pytest.fixture
-def track(written):
+def track(write_table):
     """A function that writes a table and reads it."""
-    return lambda text: read_track(written(text))
+    return lambda text: read_track(write_table(text))
 
 
 def test_interpolate_tag_rotates_headings_the_shorter_way(track):

@@ -30,10 +30,10 @@ needs_gstreamer = pytest.mark.skipif(
 
 
 @pytest.fixture
-def rpicam(tmp_path, monkeypatch, opened):
+def rpicam(tmp_path, monkeypatch, open_live_source):
     """rpicam-vid on the path, and a function that opens its camera."""
     monkeypatch.setenv("PATH", fake_rpicam.install(tmp_path))
-    return lambda: opened("rpicam")
+    return lambda: open_live_source("rpicam")
 
 
 def running(program="fake_rpicam.py"):
@@ -129,9 +129,9 @@ def test_open_source_refuses_an_invalid_pipeline(pipeline):
 
 @needs_gstreamer
 @pytest.mark.parametrize("end", ["", " ! videoconvert ! appsink drop=true"])
-def test_pipeline_gives_images_and_ends_with_the_source(opened, end):
+def test_pipeline_gives_images_and_ends_with_the_source(open_live_source, end):
     before = running("gst-launch-1.0 -q videotestsrc")
-    source = opened(GST + end)
+    source = open_live_source(GST + end)
     check_three_frames(source, (240, 320, 3))
     wait_until(lambda: source.read(1.0) and source.latency_s < 1)
     source.close()

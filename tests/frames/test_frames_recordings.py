@@ -16,7 +16,7 @@ from edgevpr.frames.source import open_source, read_intervals, read_to_end
 
 RATE_HZ = 10
 SHADES = range(0, 250, 10)  # of the frames of the test video: 2.5 s
-IN_ORDER = {"bf": "0", "sc_threshold": "0"}  # each frame is predicted from the one before
+PREDICTED_IN_ORDER = {"bf": "0", "sc_threshold": "0"}  # each frame is predicted from the one before
 
 
 @pytest.fixture
@@ -26,10 +26,10 @@ def folder(tmp_path):
 
 
 def write_picture(path):
-    path.write_bytes(photographs.encoded(path.suffix, photographs.picture()))
+    path.write_bytes(photographs.encode_image(path.suffix, photographs.picture()))
 
 
-def shade(value):
+def make_shade(value):
     return np.full((48, 64, 3), value, np.uint8)
 
 
@@ -38,7 +38,7 @@ def video(tmp_path):
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), RATE_HZ, (64, 48))
     for value in SHADES:
-        writer.write(shade(value))
+        writer.write(make_shade(value))
     writer.release()
     return path
 
@@ -55,7 +55,7 @@ def find_shades(frames):
 def test_folder_gives_names_in_utf_8(folder):
     path = os.path.join(os.fsencode(folder), b"caf\xe9.png")
     with open(path, "wb") as file:
-        file.write(photographs.encoded(".png", photographs.picture()))
+        file.write(photographs.encode_image(".png", photographs.picture()))
     (frame,) = all_frames(open_source(str(folder), live=False))
     assert frame.name == "caf\\xe9.png"
     (folder / "positions.csv").write_text("file,lat,lon\ncaf\\xe9.png,50,8\n")
@@ -182,7 +182,7 @@ def film(path, codec, options, **container):
     return path
 
 
-def read_with_complaints(path):
+def read_with_errors(path):
     source, errors = open_source(str(path), live=False), []
     frames = list(filter(None, read_to_end(source, errors.append)))
     return frames, [str(error) for error in errors], source.refused["damaged"], sum(error.count for error in errors)
@@ -193,14 +193,14 @@ def read_time(frame):
 
 
 def test_video_skips_damaged_frames_and_those_that_depend_on_them(tmp_path):
-    path = film(tmp_path / "flight.mkv", "libx264", IN_ORDER)
-    whole, complaints, *_ = read_with_complaints(path)
+    path = film(tmp_path / "flight.mkv", "libx264", PREDICTED_IN_ORDER)
+    whole, complaints, *_ = read_with_errors(path)
     assert (len(whole), complaints) == (75, [])
     damaged_file = bytearray(path.read_bytes())
     middle = len(damaged_file) // 2
     damaged_file[middle : middle + 300] = np.random.default_rng(1).bytes(300)
     path.write_bytes(damaged_file)
-    frames, complaints, damaged, missing = read_with_complaints(path)
+    frames, complaints, damaged, missing = read_with_errors(path)
     images = {read_time(frame): frame.image for frame in whole}
     assert all((images[read_time(frame)] == frame.image).all() for frame in frames)
     assert 50 <= len(frames) < 75
@@ -214,14 +214,14 @@ def test_video_skips_damaged_frames_and_those_that_depend_on_them(tmp_path):
 def test_video_skips_frames_predicted_from_a_missing_one(tmp_path):
     """Of an MPEG transport stream, recorded from a radio link that lost the packets of a whole frame: no decoder finds
     anything wrong with the frames after it."""
-    path = film(tmp_path / "flight.ts", "libx264", IN_ORDER)
-    images = {read_time(frame): frame.image for frame in read_with_complaints(path)[0]}
+    path = film(tmp_path / "flight.ts", "libx264", PREDICTED_IN_ORDER)
+    images = {read_time(frame): frame.image for frame in read_with_errors(path)[0]}
     packets = [path.read_bytes()[start : start + 188] for start in range(0, path.stat().st_size, 188)]
     video = [index for index, packet in enumerate(packets) if packet[1] & 0x1F == 1 and packet[2] == 0]
     begins = [index for index in video if packets[index][1] & 0x40]
     lost = [index for index in video if begins[35] <= index < begins[36]]
     path.write_bytes(b"".join(packet for index, packet in enumerate(packets) if index not in lost))
-    frames, complaints, damaged, _ = read_with_complaints(path)
+    frames, complaints, damaged, _ = read_with_errors(path)
     assert all((images[read_time(frame)] == frame.image).all() for frame in frames)
     assert 55 <= len(frames) <= 65
     assert (len(complaints), len(frames) + damaged) == (1, 74)
@@ -232,7 +232,7 @@ def test_truncated_video_is_reported(name, tmp_path):
     index_first = {"movflags": "faststart"} if name.endswith("mp4") else {}
     path = film(tmp_path / name, "mpeg4", {"qmin": "3", "qmax": "3"}, **index_first)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    frames, complaints, _, missing = read_with_complaints(path)
+    frames, complaints, _, missing = read_with_errors(path)
     assert 10 < len(frames) < 60
     assert len(frames) + missing == pytest.approx(75, abs=1)
     assert re.search(rf"{name} is truncated \(1\.[0-9] s of 3\.0 s\): copy the video again\.", complaints[-1])

@@ -37,7 +37,7 @@ cam0:
 """
 
 
-def written(path, text, **given):
+def write_lens(path, text, **given):
     for name, value in given.items():
         text = text.replace(name.upper(), str(value))
     path.write_text(text)
@@ -97,7 +97,7 @@ def test_calibration_script_of_the_docs_recovers_a_known_lens(tmp_path, monkeypa
 )
 def test_read_lens_of_ros_and_kalibr(tmp_path, text, model, coefficients):
     given = {"camera": "pinhole", "model": model, "number": len(coefficients)}
-    lens = read_lens(written(tmp_path / "a.yaml", text, coefficients=", ".join(map(str, coefficients)), **given))
+    lens = read_lens(write_lens(tmp_path / "a.yaml", text, coefficients=", ".join(map(str, coefficients)), **given))
     assert (*lens.focal_px, *lens.centre_px) == PINHOLE
     assert (lens.coefficients, lens.is_fisheye) == (coefficients or (0.0,) * 4, model == "equidistant")
 
@@ -123,7 +123,7 @@ def test_read_lens_of_ros_and_kalibr(tmp_path, text, model, coefficients):
     ],
 )
 def test_read_lens_refuses_files_that_are_not_calibrations(tmp_path, text, given, says):
-    path = written(tmp_path / "lens.yaml", text, **given)
+    path = write_lens(tmp_path / "lens.yaml", text, **given)
     with pytest.raises(ConfigError, match=says) as error:
         read_lens(path)
     assert str(error.value).startswith(path)

@@ -32,7 +32,7 @@ def make_frame(image, **told):
     return Frame(image=image, name="it", t_mono_s=0.0, **told)
 
 
-def taken(ground, **pose):
+def shoot(ground, **pose):
     """A frame that knows how it was taken."""
     pose = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0} | pose
     return make_frame(photograph_ground(ground, **pose), **pose)
@@ -64,7 +64,7 @@ def difference(one, other, mask):
     ],
 )
 def test_level_image_equals_an_image_taken_straight_down(ground, pose, shown, below):
-    found = level_image(taken(ground, **pose), None, LENS, FOOTPRINT_M, below=below)
+    found = level_image(shoot(ground, **pose), None, LENS, FOOTPRINT_M, below=below)
     assert (found.view.up_deg, found.view.reason) == (0.0, None)
     assert found.view.footprint_m == pytest.approx(FOOTPRINT_M)
     assert found.image.shape == (640, 640, 3)
@@ -92,7 +92,7 @@ def test_level_image_accepts_a_rotated_camera(ground, up_deg):
 
 
 def test_level_image_does_not_rotate_without_a_heading(ground):
-    steep, tilted = (replace(taken(ground, heading_deg=0, pitch_deg=deg), heading_deg=None) for deg in (25, 18))
+    steep, tilted = (replace(shoot(ground, heading_deg=0, pitch_deg=deg), heading_deg=None) for deg in (25, 18))
     assert level_image(steep, None, LENS, below=True).view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING
     for frame in (steep, tilted):
         found = level_image(frame, None, LENS)
@@ -102,15 +102,15 @@ def test_level_image_does_not_rotate_without_a_heading(ground):
 
 def test_level_image_does_not_scale_without_a_height(ground):
     pose = {"heading_deg": 60, "roll_deg": 18}
-    unknown = replace(taken(ground, **pose), height_m=None)
-    found, known = level_image(unknown, None, LENS, FOOTPRINT_M / 2), level_image(taken(ground, **pose), None, LENS)
+    unknown = replace(shoot(ground, **pose), height_m=None)
+    found, known = level_image(unknown, None, LENS, FOOTPRINT_M / 2), level_image(shoot(ground, **pose), None, LENS)
     assert found.view == replace(known.view, footprint_m=None)
     assert np.array_equal(found.image, known.image)
     assert known.view.footprint_m == pytest.approx(FOOTPRINT_M)
 
 
 def test_level_image_has_no_nadir_without_an_attitude(ground):
-    found = level_image(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
+    found = level_image(replace(shoot(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
     width_m, focal = pytest.approx(FOOTPRINT_M), pytest.approx(LENS_FOCAL)
     assert found.view == View(up_deg=0.0, footprint_m=width_m, focal=focal, rotation_deg=90.0)
     assert difference(found.image, photograph_above(ground, replace(found.view, nadir_offset=(0, 0))), found.mask) < 0.5
@@ -129,7 +129,7 @@ def test_level_image_returns_the_same_object_if_nothing_is_known_or_needed(told)
 
 def test_level_image_leaves_a_surveyed_image_unchanged(ground):
     pose = Pose(up_deg=30.0, footprint_m=50.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
-    frame = replace(taken(ground, heading_deg=90, pitch_deg=20), pose=pose)
+    frame = replace(shoot(ground, heading_deg=90, pitch_deg=20), pose=pose)
     found = level_image(frame, None, LENS, FOOTPRINT_M)
     assert found.image is frame.image
     assert found.view == View(up_deg=30.0, footprint_m=50.0, nadir_offset=(0.0, 0.0))
@@ -138,7 +138,7 @@ def test_level_image_leaves_a_surveyed_image_unchanged(ground):
 @pytest.mark.parametrize("height_m", [0.0, -3.0, 10_001.0, math.nan, math.inf, 25.0, 500.0])
 def test_level_image_ignores_an_implausible_height(ground, height_m):
     """25 and 500 m can be, and are too far from the map's to be of use."""
-    frame = replace(taken(ground, heading_deg=90), height_m=height_m)
+    frame = replace(shoot(ground, heading_deg=90), height_m=height_m)
     found, unknown = (level_image(each, None, LENS, FOOTPRINT_M) for each in (frame, replace(frame, height_m=None)))
     assert np.array_equal(found.image, unknown.image)
 
@@ -173,7 +173,7 @@ def test_level_image_keeps_the_centre_of_a_steep_image(below):
 
 def test_level_image_completes_the_frame_from_the_vehicle(ground):
     pose = {"heading_deg": 50, "roll_deg": 12, "pitch_deg": 8, "height_m": 120}
-    known = taken(ground, **pose)
+    known = shoot(ground, **pose)
     vehicle = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=300.0, t_received_s=0.0, has_gps=True, **pose)
     wrong = replace(vehicle, heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height_m=50.0)
     by_frame = level_image(known, wrong, LENS, FOOTPRINT_M)

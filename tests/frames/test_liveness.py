@@ -25,7 +25,7 @@ def measure_fault_s(watched, wanted, start_s=0.0, refusal=None, every_s=0.1):
     return None
 
 
-def is_(condition):
+def has_condition(condition):
     return lambda fault: fault.condition is condition
 
 
@@ -38,13 +38,13 @@ def must_reopen(fault):
 )
 def test_source_is_lost_after_three_seconds_or_longer_at_a_low_rate(interval_s, lost_s):
     watched = make_liveness(*(number * interval_s for number in range(8)))
-    assert measure_fault_s(watched, is_(Condition.LOST), 7 * interval_s) == lost_s
+    assert measure_fault_s(watched, has_condition(Condition.LOST), 7 * interval_s) == lost_s
     assert measure_fault_s(watched, must_reopen, 7 * interval_s) == lost_s
 
 
-LOST = is_(Condition.LOST)
-DAMAGED = is_(Condition.DAMAGED)
-LATE = is_(Condition.LATE)
+LOST = has_condition(Condition.LOST)
+DAMAGED = has_condition(Condition.DAMAGED)
+LATE = has_condition(Condition.LATE)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_reopened_source_keeps_its_rate():
     watched = make_liveness(0.0, 0.1, 0.2)
     watched.record_opening(20.0)
     watched.record_picture(25.0)
-    assert measure_fault_s(watched, is_(Condition.LOST), 25.0) == 3.0
+    assert measure_fault_s(watched, has_condition(Condition.LOST), 25.0) == 3.0
     assert make_liveness(0.0, 5.0).find_fault(10.0) is None
 
 

@@ -13,7 +13,7 @@ from answering_cameras import (
     RATE_HZ,
     WIDTH,
     Server,
-    encoded,
+    encode_image,
     http,
     multipart,
     picture,
@@ -46,7 +46,7 @@ def serve():
 
 
 @pytest.fixture
-def sending():
+def start_sending():
     """A function that sends RTP by `send`, until the end of the test, and returns the port."""
     is_on = threading.Event()
     is_on.set()
@@ -123,8 +123,8 @@ def test_open_source_refuses_a_password_that_must_be_percent_encoded(password):
 @pytest.mark.parametrize(
     "uri", ["http://127.0.0.1:9/photo@2x.jpg", "rtsp://u:p@127.0.0.1:9/a?b=c@d", "http://[::1]:9/a@b", "rtsp://h/a:b@c"]
 )
-def test_open_source_finds_no_password_in_a_path_with_an_at_sign(uri, opened):
-    assert opened(uri).is_live
+def test_open_source_finds_no_password_in_a_path_with_an_at_sign(uri, open_live_source):
+    assert open_live_source(uri).is_live
 
 
 def test_open_address_decodes_a_percent_encoded_password(serve):
@@ -151,8 +151,8 @@ def first_frame(source):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("over_tcp", ["461", "offer"])
-def test_rtsp_falls_back_to_udp(over_tcp, opened, serve):
-    source = opened(f"rtsp://{serve(rtsp(refuses='', over_tcp=over_tcp))}/stream")
+def test_rtsp_falls_back_to_udp(over_tcp, open_live_source, serve):
+    source = open_live_source(f"rtsp://{serve(rtsp(refuses='', over_tcp=over_tcp))}/stream")
     first_frame(source)
     assert (source.facts.codec, source.facts.bits, source.facts.pixel_aspect) == ("h264", 8, 1.0)
 
@@ -167,14 +167,14 @@ def test_rtsp_falls_back_to_udp(over_tcp, opened, serve):
         ("udp", lambda *where: send_rtp(*where, "mjpeg"), "mjpeg"),
     ],
 )
-def test_rtp_at_a_udp_port_is_read_without_a_description(scheme, send, codec, opened, sending):
-    source = opened(f"{scheme}://127.0.0.1:{sending(send)}")
+def test_rtp_at_a_udp_port_is_read_without_a_description(scheme, send, codec, open_live_source, start_sending):
+    source = open_live_source(f"{scheme}://127.0.0.1:{start_sending(send)}")
     first_frame(source)
     assert source.facts.codec == codec
 
 
-def test_open_address_names_ports_in_use(sending):
-    port = sending(send_rtp)
+def test_open_address_names_ports_in_use(start_sending):
+    port = start_sending(send_rtp)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", port + 1))
         assert find_cause(f"udp://:{port}") == f"UDP port {port + 1} is in use by another program"
@@ -190,23 +190,23 @@ def send_unknown(port, is_on):
             time.sleep(0.01)
 
 
-def test_rtp_of_an_unknown_codec_asks_for_a_description(sending):
-    cause = find_cause(f"udp://:{sending(send_unknown)}")
+def test_rtp_of_an_unknown_codec_asks_for_a_description(start_sending):
+    cause = find_cause(f"udp://:{start_sending(send_unknown)}")
     assert cause == "RTP with an unknown codec (payload type 98): describe it in an .sdp file"
 
 
 @pytest.mark.parametrize("has_length", [True, False])
 @pytest.mark.parametrize(("kind", "extension"), [("image/jpg", ".jpg"), ("image/png", ".png")])
-def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, opened, serve):
-    source = opened(f"http://{serve(multipart(kind, extension, has_length))}/video")
+def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, open_live_source, serve):
+    source = open_live_source(f"http://{serve(multipart(kind, extension, has_length))}/video")
     numbers = [int(first_frame(source).name.split()[1]) for _ in range(3)]
     assert numbers == sorted(set(numbers))
 
 
-def test_multipart_stream_without_lengths_does_not_wait_for_the_next_part(opened, serve):
+def test_multipart_stream_without_lengths_does_not_wait_for_the_next_part(open_live_source, serve):
     """FFmpeg gives such a picture when the next one has come, as if it had been taken then."""
     connections: list[list[float]] = []
-    source = opened(f"http://{serve(multipart(has_length=False, connections=connections))}/video")
+    source = open_live_source(f"http://{serve(multipart(has_length=False, connections=connections))}/video")
     late_s = []
     for _ in range(12):
         frame = first_frame(source)
@@ -238,7 +238,7 @@ def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
     def taken(number):
         asked_s.append(time.monotonic())
         time.sleep(0.05)
-        return encoded(number)
+        return encode_image(number)
 
     address = serve(http("200 OK", "image/jpeg", taken))
     capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
@@ -250,16 +250,16 @@ def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
 
 
 def test_snapshots_cached_by_the_camera_are_aged_from_the_previous_request(serve):
-    address = serve(http("200 OK", "image/jpeg", lambda number: encoded(number // 2)))
+    address = serve(http("200 OK", "image/jpeg", lambda number: encode_image(number // 2)))
     capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     *_, last = (capture.read() for _ in range(4))
     assert time.monotonic() - last.t_mono_s > 0.1
 
 
-def test_snapshots_truncated_are_damaged_and_failed_ones_lost(opened, serve):
-    pictures = iter([encoded(0), encoded(1), encoded(2)[:900], b""])
+def test_snapshots_truncated_are_damaged_and_failed_ones_lost(open_live_source, serve):
+    pictures = iter([encode_image(0), encode_image(1), encode_image(2)[:900], b""])
     server = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
-    source = opened(f"http://{server.address}/snapshot.jpg")
+    source = open_live_source(f"http://{server.address}/snapshot.jpg")
     wait_until(lambda: source.refused["damaged"] >= 1)
     server.close()
     wait_until(lambda: source.condition is Condition.LOST)
@@ -271,7 +271,7 @@ def test_snapshots_accept_a_password(serve):
     def answer(connection, asked):
         _, headers = read_request(asked)
         is_right = headers.get("authorization") == right
-        picture, status = (encoded(0), "200 OK") if is_right else (b"", f"401 Unauthorized\r\n{BASIC}")
+        picture, status = (encode_image(0), "200 OK") if is_right else (b"", f"401 Unauthorized\r\n{BASIC}")
         head = f"HTTP/1.0 {status}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
         connection.sendall(head.encode() + picture)
 

@@ -24,7 +24,7 @@ def transport_stream(connection, codec="mpeg2video", **options):
     return Encoder(connection.sendall, "mpegts", codec, RATE_HZ, (WIDTH, HEIGHT), {"g": "5", **options})
 
 
-def pictures_then_sound(connection):
+def send_then_sound(connection):
     encoder = transport_stream(connection)
     sound = encoder.box.add_stream("mp2", rate=16000)
     sound.layout = "mono"
@@ -53,7 +53,7 @@ def two_codecs(connection):
     one_codec(connection)
 
 
-@pytest.mark.parametrize(("first", "later"), [(pictures_then_sound, pictures_then_sound), (two_codecs, one_codec)])
+@pytest.mark.parametrize(("first", "later"), [(send_then_sound, send_then_sound), (two_codecs, one_codec)])
 def test_stream_without_further_images_is_lost_and_reopened(first, later):
     viewers = []
 

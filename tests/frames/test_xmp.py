@@ -27,7 +27,7 @@ def read(tmp_path):
     """Read a packet from the place where cameras put it, in a segment before the picture."""
 
     def of(content):
-        jpeg = photographs.encoded(".jpg", photographs.picture())
+        jpeg = photographs.encode_image(".jpg", photographs.picture())
         path = tmp_path / "photo.jpg"
         path.write_bytes(photographs.with_app1(jpeg, content, b"http://ns.adobe.com/xap/1.0/\x00"))
         return read_xmp(path)

@@ -18,19 +18,19 @@ XMP = '<x:xmpmeta><rdf:Description drone-dji:GimbalYawDegree="0" drone-dji:Gimba
 XMP += 'drone-dji:GimbalRollDegree="0"/></x:xmpmeta>'
 
 
-def down(number):
+def downward_view(number):
     """A picture of a camera that looks down, and moves up the picture by a quarter of it."""
     return GROUND[1200 - 60 * number :, 500:][:240, :320]
 
 
-def ahead(number):
+def forward_view(number):
     """A picture of a camera that looks ahead: the same things, larger."""
     half = 300 / 1.08**number
     rows, columns = (slice(round(750 - share * half), round(750 + share * half)) for share in (0.75, 1))
     return cv2.resize(GROUND[rows, columns], (320, 240), interpolation=cv2.INTER_AREA)
 
 
-def with_xmp(path, pitch_deg):
+def add_xmp(path, pitch_deg):
     """Write into a JPEG that its gimbal had this pitch."""
     content, packet = path.read_bytes(), b"http://ns.adobe.com/xap/1.0/\0" + XMP.format(pitch_deg).encode()
     path.write_bytes(content[:2] + b"\xff\xe1" + (len(packet) + 2).to_bytes(2, "big") + packet + content[2:])
@@ -44,7 +44,7 @@ def folder(tmp_path):
             path = tmp_path / "images" / f"{number}.jpg"
             cv2.imwrite(str(path), view(number))
             if pitch_deg is not None:
-                with_xmp(path, pitch_deg)
+                add_xmp(path, pitch_deg)
         if lines:
             (tmp_path / "positions.csv").write_text("\n".join(["file,lat,lon", *lines]) + "\n")
         return tmp_path
@@ -60,7 +60,7 @@ def build(folder, *flags, images="images"):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("view", "pitch_deg", "code"),
-    [(down, None, 2), (ahead, None, 0), (down, -10, 0), (ahead, -85, 2)],
+    [(downward_view, None, 2), (forward_view, None, 0), (downward_view, -10, 0), (forward_view, -85, 2)],
     ids=["down", "ahead", "a gimbal that looks ahead", "a gimbal that looks down"],
 )
 def test_map_build_requires_camera_nadir_for_downward_images(folder, view, pitch_deg, code):
@@ -72,7 +72,7 @@ def test_map_build_requires_camera_nadir_for_downward_images(folder, view, pitch
 @pytest.mark.slow
 def test_map_build_reports_the_covered_ground(folder, capsys):
     lines = [f"{number}.jpg,{50 + 0.001 * number:.3f},{8 if number % 2 else 8.001}" for number in range(8)]
-    assert build(folder(ahead, lines), "--no-calibrate") == 0
+    assert build(folder(forward_view, lines), "--no-calibrate") == 0
     covered = json.loads(capsys.readouterr().out)["covered"]
     assert covered["north_south_m"] == pytest.approx(778, abs=2)
     assert covered["east_west_m"] == pytest.approx(71, abs=1)
@@ -81,39 +81,39 @@ def test_map_build_reports_the_covered_ground(folder, capsys):
     assert covered["track_m"] == pytest.approx(7 * 132, abs=5)
 
 
-def bare(number: int) -> Image:
+def ground_view(number: int) -> Image:
     return GROUND[20 * number :, 40 * number :][:240, :320].copy()
 
 
-def drawn_over(number: int) -> Image:
+def view_with_display(number: int) -> Image:
     """A picture with a height, which changes, and a cross."""
-    image = cv2.cvtColor(bare(number), cv2.COLOR_GRAY2BGR)
+    image = cv2.cvtColor(ground_view(number), cv2.COLOR_GRAY2BGR)
     cv2.drawMarker(image, (160, 120), (255, 255, 255), cv2.MARKER_CROSS, 30, 2)
     cv2.putText(image, f"ALT {100 + number}", (8, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2)
     return image
 
 
 def test_measure_static_fraction_finds_only_the_overlay():
-    assert measure_static_fraction(map(bare, range(20)), None) == 0
-    assert 0.006 < measure_static_fraction(map(drawn_over, range(20)), None) < 0.05
+    assert measure_static_fraction(map(ground_view, range(20)), None) == 0
+    assert 0.006 < measure_static_fraction(map(view_with_display, range(20)), None) < 0.05
 
 
 def test_measure_static_fraction_leaves_out_the_mask(tmp_path):
     painted = np.full((240, 320), 255, np.uint8)
     painted[:45, :150] = painted[95:145, 135:185] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), painted)
-    assert measure_static_fraction(map(drawn_over, range(20)), load_mask(str(tmp_path / "mask.png"))) == 0
+    assert measure_static_fraction(map(view_with_display, range(20)), load_mask(str(tmp_path / "mask.png"))) == 0
 
 
 @pytest.mark.parametrize("numbers", [range(11), [3] * 20], ids=["few pictures", "an aircraft that stands"])
 def test_measure_static_fraction_is_unknown_without_enough_evidence(numbers):
-    assert measure_static_fraction(map(drawn_over, numbers), None) is None
+    assert measure_static_fraction(map(view_with_display, numbers), None) is None
 
 
 @pytest.mark.slow
 def test_map_build_warns_of_a_display(tmp_path, caplog):
     for number in range(16):
-        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), drawn_over(number))
+        cv2.imwrite(str(tmp_path / f"{number:02d}.png"), view_with_display(number))
     flags = "--technique", "cohog", "--camera", "nadir", "--no-refine", "--no-calibrate"
     assert main(["map", "build", str(tmp_path / "m.gpkg"), "--images", str(tmp_path), *flags]) == 0
     assert "--mask PNG" in caplog.text

@@ -23,7 +23,7 @@ def flight(legs=5, a_leg=12, seed=0):
     return position, np.log(FOOTPRINT_M * rng.uniform(0.9, 1.1, len(position))) - 1j * np.radians(up_deg)
 
 
-def ties_of(position, log, seed=0, wrong=0.0, within=0.6):
+def make_ties(position, log, seed=0, wrong=0.0, within=0.6):
     """Return noisy ties of all pairs that overlap; a share of them is wrong."""
     rng = np.random.default_rng((seed, 1))
     away = abs(position[:, None] - position)
@@ -41,7 +41,7 @@ def ties_of(position, log, seed=0, wrong=0.0, within=0.6):
     return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd, turn_sd=turn_sd), lies
 
 
-def recorded_of(position, seed=0):
+def record_positions(position, seed=0):
     rng = np.random.default_rng((seed, 2))
     return position + RECORDED_SD_M * (rng.normal(size=len(position)) + 1j * rng.normal(size=len(position)))
 
@@ -50,7 +50,7 @@ def rms(values):
     return float(np.sqrt(np.mean(abs(values) ** 2) / 2))
 
 
-def off(solved, position, log):
+def measure_errors(solved, position, log):
     """Errors of positions, m, and of logs; the imaginary part of a log is an angle."""
     turned = solved.log - log
     return solved.position - position, turned.real + 1j * ((turned.imag + np.pi) % (2 * np.pi) - np.pi)
@@ -59,9 +59,9 @@ def off(solved, position, log):
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
 def test_solve_graph_corrects_noisy_positions_and_lists_wrong_ties(wrong):
     position, log = flight()
-    ties, lies = ties_of(position, log, wrong=wrong)
-    solved = solve_graph(recorded_of(position), ties)
-    off_m, turned = off(solved, position, log)
+    ties, lies = make_ties(position, log, wrong=wrong)
+    solved = solve_graph(record_positions(position), ties)
+    off_m, turned = measure_errors(solved, position, log)
     assert rms(off_m) < RECORDED_SD_M / 3
     assert rms(off_m - off_m.mean()) < RECORDED_SD_M / 4
     assert rms(turned) < 0.06
@@ -75,9 +75,9 @@ def test_solve_graph_covariances_match_the_errors():
     position, log = flight(legs=3, a_leg=8)
     far, turned = [], []
     for seed in range(30):
-        ties, _ = ties_of(position, log, seed)
-        solved = solve_graph(recorded_of(position, seed), ties)
-        off_m, off_log = off(solved, position, log)
+        ties, _ = make_ties(position, log, seed)
+        solved = solve_graph(record_positions(position, seed), ties)
+        off_m, off_log = measure_errors(solved, position, log)
         far.append(off_m / np.sqrt(solved.position_var / 2))
         turned.append(off_log / np.sqrt(solved.log_var / 2))
     for each in (far, turned):

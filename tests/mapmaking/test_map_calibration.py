@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from pictures import textured
-from walks import map_of, query_meter
+from walks import make_map, query_meter
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
@@ -38,7 +38,7 @@ def frame(number, **more):
     return Frame(image=textured(number, 240, 320), name=f"{number}.png", t_mono_s=0.0, position=position, **more)
 
 
-def at_hand(*frames):
+def make_picture_source(*frames):
     """Give the frames of these names, and remember which were asked for."""
     asked = []
 
@@ -50,7 +50,7 @@ def at_hand(*frames):
 
 
 @pytest.fixture(autouse=True)
-def few(monkeypatch):
+def few_suffice(monkeypatch):
     """A map of few places is enough, and few questions."""
     monkeypatch.setattr(calibrating, "MIN_PLACES", PLACES)
     monkeypatch.setattr(calibrating, "count_queries", lambda technique: 2 * PLACES)
@@ -58,11 +58,11 @@ def few(monkeypatch):
 
 @pytest.fixture
 def place_map(tmp_path):
-    with PlaceMap.open_for_writing(map_of(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)))) as place_map:
+    with PlaceMap.open_for_writing(make_map(tmp_path / "m.gpkg", AHEAD, map(frame, range(PLACES)))) as place_map:
         yield place_map
 
 
-def calibrated(place_map, pictures, technique=AHEAD, **more):
+def calibrate_with(place_map, pictures, technique=AHEAD, **more):
     encoder = FrameEncoder(technique=technique, **more)
     return calibrate(encoder, place_map, CONFIG, query_meter(), pictures, iterate_silently)
 
@@ -81,8 +81,8 @@ def test_query_map_queries_each_image_in_three_ways(place_map):
 
 
 def test_calibration_is_stored_in_the_map(place_map):
-    pictures, asked = at_hand(*map(frame, range(PLACES)))
-    found = calibrated(place_map, pictures)
+    pictures, asked = make_picture_source(*map(frame, range(PLACES)))
+    found = calibrate_with(place_map, pictures)
     assert read_calibration(place_map.calibration) == found
     assert sorted(asked) == sorted(3 * [f"{number}.png" for number in range(PLACES)]), "once for its look-alikes"
     assert sorted(found.look_alikes.places) == list(range(1, PLACES + 1))
@@ -96,7 +96,7 @@ def test_calibration_skips_an_unreadable_place(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
     build_map([frame(20)], FrameEncoder(technique=AHEAD), place_map)
-    found = calibrated(place_map, at_hand(*map(frame, (*range(PLACES), 20)))[0])
+    found = calibrate_with(place_map, make_picture_source(*map(frame, (*range(PLACES), 20)))[0])
     assert sorted(found.recognisable) == [1, 2, 4, 5, 6, 7, 8, 9]
 
 
@@ -108,11 +108,11 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
     def levelling():
         return Levelling(Lens(60.0), below=True, is_live=False)
 
-    path = map_of(tmp_path / "m.gpkg", down, tilted, levelling=levelling())
+    path = make_map(tmp_path / "m.gpkg", down, tilted, levelling=levelling())
     with PlaceMap.open_for_writing(path) as place_map:
         with pytest.raises(UsageError, match=" 0 places"):
-            calibrated(place_map, at_hand(tilted[0])[0], down)
-        found = calibrated(place_map, at_hand(*tilted)[0], down, levelling=levelling())
+            calibrate_with(place_map, make_picture_source(tilted[0])[0], down)
+        found = calibrate_with(place_map, make_picture_source(*tilted)[0], down, levelling=levelling())
     assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
 
 
@@ -121,7 +121,7 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
 )
 def test_build_map_counts_tilted_images_by_what_is_missing(tmp_path, pitch_deg, heading_deg, left_out):
     down = create("cohog", {"camera": "nadir", "w1": 208})
-    path = map_of(tmp_path / "down.gpkg", down, [])
+    path = make_map(tmp_path / "down.gpkg", down, [])
     pose = {"roll_deg": 0.0, "pitch_deg": pitch_deg, "heading_deg": heading_deg, "height_m": 90.0}
     encoder = FrameEncoder(technique=down, levelling=Levelling(Lens(60.0), below=True, is_live=False))
     with PlaceMap.open_for_writing(path) as place_map:
@@ -140,8 +140,8 @@ def test_calibration_reports_a_map_that_looks_alike_everywhere(tmp_path):
         image = np.clip(waves + noise, 0, 255).astype(np.uint8)
         return Frame(image=image, name=f"{number}.png", t_mono_s=0.0, position=Position(50 + 0.002 * number, 8.0))
 
-    with PlaceMap.open_for_writing(map_of(tmp_path / "m.gpkg", AHEAD, map(water, range(PLACES)))) as place_map:
-        found = calibrated(place_map, at_hand(*map(water, range(PLACES)))[0])
+    with PlaceMap.open_for_writing(make_map(tmp_path / "m.gpkg", AHEAD, map(water, range(PLACES)))) as place_map:
+        found = calibrate_with(place_map, make_picture_source(*map(water, range(PLACES)))[0])
     assert found.looks_alike
     assert found.accepted < 0.3
 
@@ -149,7 +149,7 @@ def test_calibration_reports_a_map_that_looks_alike_everywhere(tmp_path):
 START = Logistic(("a", "b"), (0.0, 0.0), (1.0, 2.0), 0.0)
 
 
-def rows_of(count, seed=1):
+def make_rows(count, seed=1):
     """Rows of which `a` tells whether they are right, and `b` nothing."""
     rng = np.random.default_rng(seed)
     right = rng.random(count) < 0.5
@@ -157,7 +157,7 @@ def rows_of(count, seed=1):
 
 
 def test_fit_logistic_weights_only_features_that_separate_the_classes():
-    rows, right = rows_of(2000)
+    rows, right = make_rows(2000)
     found = fit_logistic(START, rows, right, np.ones(len(rows)), 1.0)
     # Two normal distributions, 1 apart with the variance 0.25: the logit is 4 (a - 0.5).
     assert found.weights == (pytest.approx(4, abs=0.5), pytest.approx(0, abs=0.15))
@@ -166,8 +166,8 @@ def test_fit_logistic_weights_only_features_that_separate_the_classes():
 
 
 def test_fit_logistic_with_a_strong_prior_changes_only_the_bias():
-    rows, right = rows_of(200)
-    start = fit_logistic(START, *rows_of(2000, seed=2), np.ones(2000), 1.0)
+    rows, right = make_rows(200)
+    start = fit_logistic(START, *make_rows(2000, seed=2), np.ones(2000), 1.0)
     found = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
     assert found.weights == pytest.approx(start.weights, abs=0.01)
     assert found.bias < start.bias - 1

@@ -32,30 +32,30 @@ ITEMS = [
 ]
 
 
-def written(tmp_path, said):
+def write_mission_file(tmp_path, said):
     path = tmp_path / "area"
     path.write_text(said if isinstance(said, str) else json.dumps(said))
     return path
 
 
 def test_read_area_reads_only_flown_waypoints_of_a_waypoint_file(tmp_path):
-    area = read_area(written(tmp_path, WAYPOINTS))
+    area = read_area(write_mission_file(tmp_path, WAYPOINTS))
     assert area.path == (Waypoint(50.001, 11.9), Waypoint(50.002, 11.901, 60.0), Waypoint(50.003, 11.903, 70.0))
     assert area.extent_deg == pytest.approx((50.001, 11.9, 50.003, 11.903))
 
 
 def test_read_area_reads_waypoints_and_survey_of_a_plan(tmp_path):
-    area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": ITEMS}}))
+    area = read_area(write_mission_file(tmp_path, {"fileType": "Plan", "mission": {"items": ITEMS}}))
     assert area.path == (Waypoint(50.0, 11.9, 50.0), Waypoint(50.001, 11.9, 80), Waypoint(50.009, 11.9, 80))
 
 
 def test_read_area_reads_the_outline_of_a_structure_scan(tmp_path):
     scan = {"type": "ComplexItem", "complexItemType": "StructureScan", "polygon": [[50.0, 11.9], [50.01, 11.9]]}
-    area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": [scan]}}))
+    area = read_area(write_mission_file(tmp_path, {"fileType": "Plan", "mission": {"items": [scan]}}))
     assert area.path == (Waypoint(50.0, 11.9), Waypoint(50.01, 11.9), Waypoint(50.0, 11.9))
 
 
-def _plan_of(point):
+def _make_plan(point):
     """A plan with a survey of one point."""
     survey = '{"type": "ComplexItem", "TransectStyleComplexItem": {"VisualTransectPoints": [POINT]}}'
     return '{"mission": {"items": [ITEM]}}'.replace("ITEM", survey.replace("POINT", point))
@@ -74,21 +74,21 @@ def _plan_of(point):
         '{"type": "Polygon", "coordinates": []}',
         '{"fileType": "Plan"}',
         '{"fileType": "Plan", "mission": {"items": [{}]}}',
-        _plan_of("[NaN, 50]"),
-        _plan_of("[1" + 400 * "0" + ", 50]"),
+        _make_plan("[NaN, 50]"),
+        _make_plan("[1" + 400 * "0" + ", 50]"),
     ],
 )
 def test_read_area_refuses_an_invalid_mission_in_one_sentence(tmp_path, said):
     with pytest.raises(UsageError, match="save"):
-        read_area(written(tmp_path, said))
+        read_area(write_mission_file(tmp_path, said))
 
 
 def test_read_area_refuses_an_empty_or_invalid_area_and_a_foreign_file(tmp_path):
     for empty in ("QGC WPL 110\n", {"fileType": "Plan", "mission": {"items": []}}):
         with pytest.raises(UsageError, match="no waypoints"):
-            read_area(written(tmp_path, empty))
+            read_area(write_mission_file(tmp_path, empty))
     with pytest.raises(UsageError, match="invalid coordinates"):
-        read_area(written(tmp_path, "QGC WPL 110\n0 1 3 16 0 0 0 0 5542661 707819 0 1"))
+        read_area(write_mission_file(tmp_path, "QGC WPL 110\n0 1 3 16 0 0 0 0 5542661 707819 0 1"))
     (tmp_path / "picture").write_bytes(b"\xff\xd8\xff\xe0")
     with pytest.raises(UsageError, match="save"):
         read_area(tmp_path / "picture")

@@ -20,7 +20,7 @@ from edgevpr.techniques import create
 HOME = 47.0, 8.0
 OFF_M = 3.0, -4.0
 SURVEY = {"kind": "survey", "said": "", "matches": 99, "middle": {"lat_deg": HOME[0], "lon_deg": HOME[1]}}
-FOUND = SURVEY | {"off_m": list(OFF_M), "off_sd": 0.4, "scale": None, "scale_sd": None}
+RESULT = SURVEY | {"off_m": list(OFF_M), "off_sd": 0.4, "scale": None, "scale_sd": None}
 PICTURE = np.zeros((8, 8), np.uint8)
 
 
@@ -40,7 +40,7 @@ def path(tmp_path):
     return tmp_path / "m.gpkg"
 
 
-def log_of(path, *lines):
+def write_flight_log(path, *lines):
     """The log of a flight with the map, as it is now."""
     log = path.with_name("flight.jsonl")
     with PlaceMap.open(path) as place_map:
@@ -49,17 +49,17 @@ def log_of(path, *lines):
     return log
 
 
-def places_of(path, numbers=None):
+def read_places(path, numbers=None):
     with PlaceMap.open(path) as place_map:
         return list(place_map.read_places(numbers))
 
 
 def test_move_map_moves_each_position_by_the_last_survey_of_the_flight(path, capsys):
-    log = log_of(path, FOUND | {"off_m": [99.0, 0.0]}, FOUND)
-    before = places_of(path)
+    log = write_flight_log(path, RESULT | {"off_m": [99.0, 0.0]}, RESULT)
+    before = read_places(path)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
     assert "3 places moved 3.0 m west and 4.0 m north, +-0.4 m" in capsys.readouterr().out
-    after = places_of(path)
+    after = read_places(path)
     for one, other in zip(before[:2], after[:2], strict=True):
         step = offset_m(one.position.lat_deg, one.position.lon_deg, other.position.lat_deg, other.position.lon_deg)
         assert step == pytest.approx((-3.0, 4.0), abs=1e-3)
@@ -71,33 +71,33 @@ def test_move_map_moves_each_position_by_the_last_survey_of_the_flight(path, cap
 
 
 def test_move_map_corrects_the_scale_around_the_middle_of_the_flight(path, capsys):
-    log = log_of(path, FOUND | {"scale": 0.01})
+    log = write_flight_log(path, RESULT | {"scale": 0.01})
     assert run_json(capsys, "map", "move", path, "--by", log)["scale"] == 0.01
-    first, second, _ = places_of(path)
+    first, second, _ = read_places(path)
     at_m = offset_m(*HOME, second.position.lat_deg, second.position.lon_deg)
     assert at_m == pytest.approx((500 / 1.01 - 3.0, 4.0), abs=1e-2)
     assert first.pose.footprint_m == pytest.approx(130 / 1.01)
 
 
 def test_move_map_applies_a_log_only_once(path):
-    log = log_of(path, FOUND)
+    log = write_flight_log(path, RESULT)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
     with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match="changed or moved"):
         move_map(place_map, log)
 
 
-@pytest.mark.parametrize("lines", [(), (SURVEY | FOUND | {"off_m": None, "off_sd": None},), (FOUND, SURVEY)])
+@pytest.mark.parametrize("lines", [(), (SURVEY | RESULT | {"off_m": None, "off_sd": None},), (RESULT, SURVEY)])
 def test_move_map_moves_nothing_without_a_survey(path, lines, capsys):
-    log, before = log_of(path, *lines), places_of(path)
+    log, before = write_flight_log(path, *lines), read_places(path)
     assert main(["map", "move", str(path), "--by", str(log)]) != 0
     assert "no measured map offset" in capsys.readouterr().err
-    assert places_of(path) == before
+    assert read_places(path) == before
 
 
 def test_move_map_moves_nothing_if_a_place_is_damaged(path):
     with PlaceMap.open_for_writing(path) as place_map, place_map.transaction():
         place_map.db.execute("UPDATE places SET heading_deg = 'north' WHERE place_id = 2")
-    log, before = log_of(path, FOUND), places_of(path, [1])
+    log, before = write_flight_log(path, RESULT), read_places(path, [1])
     with PlaceMap.open_for_writing(path) as place_map, pytest.raises(PlaceError):
         move_map(place_map, log)
-    assert places_of(path, [1]) == before
+    assert read_places(path, [1]) == before

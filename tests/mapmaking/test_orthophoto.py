@@ -7,7 +7,7 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 
 import rasterio
 from rasterio.warp import transform
-from rasters import HOME, MARKS_M, grid, marked, marked_raster, write_raster
+from rasters import HOME, MARKS_M, draw_marks, grid, marked_raster, write_raster
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -98,7 +98,7 @@ def test_cut_masks_ground_beyond_the_edge(tmp_path):
     assert orthophoto.resolution_m == pytest.approx(0.25, rel=0.01)
 
 
-def spread(kind: str, bright: np.ndarray) -> tuple[np.ndarray, dict]:
+def convert_marks(kind: str, bright: np.ndarray) -> tuple[np.ndarray, dict]:
     """The marks in another form of file, with the west half of the ground without data where the form can say so."""
     byte = bright.astype(np.uint8)
     known = np.full(byte.shape, 255, np.uint8)
@@ -116,7 +116,7 @@ def spread(kind: str, bright: np.ndarray) -> tuple[np.ndarray, dict]:
 @pytest.mark.parametrize("kind", ["grey", "alpha", "grey and alpha", "near infrared", "nodata"])
 def test_orthophoto_reads_each_file_format(tmp_path, kind):
     to_crs, east_m, north_m = grid("EPSG:32632", 0.25, 640)
-    bands, profile = spread(kind, marked(east_m, north_m))
+    bands, profile = convert_marks(kind, draw_marks(east_m, north_m))
     picture, valid = cut(write_raster(tmp_path / "o.tif", bands, "EPSG:32632", to_crs, **profile))
     assert picture.shape == (SIDE_PX, SIDE_PX, 3)
     if "alpha" in kind or kind == "nodata":
@@ -139,7 +139,7 @@ def refused(path) -> str:
 
 def test_orthophoto_refuses_other_files_in_one_sentence(tmp_path):
     to_crs, east_m, north_m = grid("EPSG:32632", 1.0, 64)
-    bright = marked(east_m, north_m)
+    bright = draw_marks(east_m, north_m)
     byte = bright.astype(np.uint8)[None]
     assert "missing.tif" in refused(tmp_path / "missing.tif")
     assert "is a folder" in refused(tmp_path)

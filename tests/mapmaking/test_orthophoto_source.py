@@ -20,20 +20,20 @@ from edgevpr.mapmaking.pictures import OrthophotoGrid
 pytestmark = pytest.mark.slow
 
 
-def frames_of(source: OrthophotoSource) -> list:
+def read_all_frames(source: OrthophotoSource) -> list:
     frames = []
     while not source.ended:
         frames.append(source.read(1.0))
     return [frame for frame in frames if frame is not None]
 
 
-def source_of(path, footprint_m, spacing_m, area=None, only=None) -> OrthophotoSource:
+def open_grid(path, footprint_m, spacing_m, area=None, only=None) -> OrthophotoSource:
     orthophoto = Orthophoto(path)
     lattice = make_lattice(orthophoto, footprint_m, spacing_m, area)
     return OrthophotoSource(orthophoto, [lattice], only=only)
 
 
-def off_m(lattice) -> np.ndarray:
+def compute_offsets_m(lattice) -> np.ndarray:
     """Metres east and north of HOME, (N, 2)."""
     return np.column_stack(ground_m(lattice.lat_deg, lattice.lon_deg))
 
@@ -46,7 +46,7 @@ def waypoint(east_m: float, north_m: float) -> Waypoint:
 def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
     path = marked_raster(tmp_path / "o.tif", crs, pixel_m=0.5, side_px=400)
     lattice = make_lattice(Orthophoto(path), 80.0, 20.0)
-    points_m = off_m(lattice).reshape(*lattice.shape, 2)
+    points_m = compute_offsets_m(lattice).reshape(*lattice.shape, 2)
     assert min(lattice.shape) >= 3
     np.testing.assert_allclose(np.diff(points_m[..., 0], axis=1), 20, atol=0.01)
     np.testing.assert_allclose(np.diff(points_m[..., 1], axis=0), -20, atol=0.01)
@@ -55,8 +55,8 @@ def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
 
 
 def test_frames_have_position_and_footprint(tmp_path):
-    source = source_of(marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400), 80.0, 60.0)
-    frames = frames_of(source)
+    source = open_grid(marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400), 80.0, 60.0)
+    frames = read_all_frames(source)
     assert source.total == 9 == len(frames)
     assert (source.is_live, source.dropped, source.state, source.read(0)) == (False, None, "ended", None)
     assert [frame.name for frame in frames[:4]] == [f"o.tif_r00{at // 3}_c00{at % 3}" for at in range(4)]
@@ -73,21 +73,21 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     to_crs, _, _ = grid("EPSG:32632", 0.5, 400)
     picture = np.full((1, 400, 400), 90, np.uint8)
     picture[..., :150] = 0
-    source = source_of(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 40.0)
-    kept = frames_of(source)
+    source = open_grid(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0), 60.0, 40.0)
+    kept = read_all_frames(source)
     assert 0 < len(kept) < source.total
     assert source.counts["without_data"] == source.total - len(kept)
     east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
     assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
 
-    turned = source_of(marked_raster(tmp_path / "turned.tif", rotation_deg=45), 40.0, 40.0)
-    assert 0.3 < len(frames_of(turned)) / turned.total < 0.7
+    turned = open_grid(marked_raster(tmp_path / "turned.tif", rotation_deg=45), 40.0, 40.0)
+    assert 0.3 < len(read_all_frames(turned)) / turned.total < 0.7
 
 
 def test_make_lattice_keeps_places_near_the_path_of_the_area(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
     way = Area(path=(waypoint(-100, -50), waypoint(50, 100), waypoint(50, 150)))
-    points_m = off_m(make_lattice(Orthophoto(path), 25.0, 5.0, way))
+    points_m = compute_offsets_m(make_lattice(Orthophoto(path), 25.0, 5.0, way))
     ends_m = np.array([(-100, -50), (50, 100), (50, 150)], float)
     away_m = np.full(len(points_m), np.inf)
     for begin, end in pairwise(ends_m):
@@ -130,8 +130,8 @@ def test_make_lattice_refuses_an_area_elsewhere_with_both_extents(tmp_path):
 
 def test_make_lattice_keeps_grid_and_names_within_an_area(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
-    every = {frame.name: frame.position for frame in frames_of(source_of(path, 80.0, 30.0))}
-    some = frames_of(source_of(path, 80.0, 30.0, Area(path=(waypoint(60, 60),))))
+    every = {frame.name: frame.position for frame in read_all_frames(open_grid(path, 80.0, 30.0))}
+    some = read_all_frames(open_grid(path, 80.0, 30.0, Area(path=(waypoint(60, 60),))))
     assert 2 <= len(some) < len(every)
     for frame in some:
         there = every[frame.name]
@@ -144,22 +144,22 @@ def test_places_under_cloud_are_counted(tmp_path):
     path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
     with rasterio.open(path, "r+") as raster:
         raster.write(np.full((1, 200, 200), 240, np.uint8), window=rasterio.windows.Window(220, 220, 200, 200))
-    source = source_of(path, 100.0, 60.0)
-    frames = frames_of(source)
+    source = open_grid(path, 100.0, 60.0)
+    frames = read_all_frames(source)
     assert (len(frames), source.counts["white"]) == (16, 4)
 
 
 def test_orthophoto_source_cuts_each_place_at_several_footprints(tmp_path):
     path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
     source = OrthophotoGrid(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()
-    frames = frames_of(source)
+    frames = read_all_frames(source)
     assert len({frame.name for frame in frames}) == len(frames) == source.total
     assert {frame.pose.footprint_m for frame in frames if "_150m_" in frame.name} == {150.0}
     assert {frame.pose.footprint_m for frame in frames if "_100m_" in frame.name} == {100.0}
     again = OrthophotoGrid(orthophoto=str(path), footprint_m=(100.0, 150.0), spacing_m=50.0).open(
         only=[frames[-1].name]
     )
-    (one,) = frames_of(again)
+    (one,) = read_all_frames(again)
     assert np.array_equal(one.image, frames[-1].image)
     with pytest.raises(UsageError, match="--footprint-m is 5000"):
         OrthophotoGrid(orthophoto=str(path), footprint_m=(100.0, 5000.0), spacing_m=50.0).open()

@@ -38,7 +38,7 @@ _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[3] / "shar
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory):
+def flown_dir(tmp_path_factory):
     """A folder of pictures of two legs, their true poses, and noisy positions of which one is a glitch."""
     folder = tmp_path_factory.mktemp("flown")
     (folder / "images").mkdir()
@@ -57,17 +57,17 @@ def flown(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def built(flown, tmp_path_factory):
+def unrefined_map(flown_dir, tmp_path_factory):
     """A map of them, not refined."""
     path = tmp_path_factory.mktemp("built") / "m.gpkg"
-    flags = ["--images", str(flown[0] / "images"), "--technique", "cohog", "--camera", "nadir", "--no-refine"]
+    flags = ["--images", str(flown_dir[0] / "images"), "--technique", "cohog", "--camera", "nadir", "--no-refine"]
     assert main(["map", "build", str(path), *flags]) == 0
     return path
 
 
 @pytest.fixture
-def map_path(built, tmp_path):
-    return shutil.copy(built, tmp_path / "m.gpkg")
+def map_path(unrefined_map, tmp_path):
+    return shutil.copy(unrefined_map, tmp_path / "m.gpkg")
 
 
 def errors_m(place_map, poses):
@@ -82,8 +82,8 @@ def errors_m(place_map, poses):
     return np.array(off_m), np.array(rotation_deg)
 
 
-def test_refine_moves_places_to_the_true_positions_of_their_images(flown, map_path, capsys):
-    _, poses = flown
+def test_refine_moves_places_to_the_true_positions_of_their_images(flown_dir, map_path, capsys):
+    _, poses = flown_dir
     with PlaceMap.open(map_path) as place_map:
         before_m, _ = errors_m(place_map, poses)
     refined = run_json(capsys, "map", "refine", map_path)
@@ -132,9 +132,9 @@ def test_refine_restarts_from_the_recorded_positions(map_path, capsys):
     assert "place 10 (009.jpg): recorded 2" in said
 
 
-def some_of(built, path, numbers, position=lambda number, place: place.position):
+def copy_some_places(unrefined_map, path, numbers, position=lambda number, place: place.position):
     """A map of some places of another, in this order, at other positions."""
-    with PlaceMap.open(built) as there, PlaceMap.create(path, there.spec) as place_map:
+    with PlaceMap.open(unrefined_map) as there, PlaceMap.create(path, there.spec) as place_map:
         technique = create_technique(there)
         for place in there.read_places(numbers):
             fine, _ = there.read_fine_part(place.place_id)
@@ -151,7 +151,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
     return path
 
 
-def refined_of(path, images=None):
+def refine_copy(path, images=None):
     with PlaceMap.open_for_writing(path) as place_map:
         technique = create_technique(place_map)
         return refine(place_map, technique, iterate_silently, images), list(place_map.read_places())
@@ -170,12 +170,12 @@ def refined_of(path, images=None):
     ],
 )
 def test_refine_refines_maps_of_any_kind_as_far_as_they_can_be(
-    built, tmp_path, numbers, position, refined, without_position
+    unrefined_map, tmp_path, numbers, position, refined, without_position
 ):
-    path = some_of(built, tmp_path / "m.gpkg", numbers, *([position] if position else []))
+    path = copy_some_places(unrefined_map, tmp_path / "m.gpkg", numbers, *([position] if position else []))
     with PlaceMap.open(path) as place_map:
         before = [place.position for place in place_map.read_places()]
-    found, places = refined_of(path)
+    found, places = refine_copy(path)
     assert (found.places, found.refined, found.without_position) == (len(before), refined, without_position)
     for place, was in zip(places, before, strict=True):
         if place.pose is None and was is not None:
@@ -196,27 +196,27 @@ def test_refine_ties_images_by_votes_without_landmarks(tmp_path):
                     image=image, name=row["file"], t_mono_s=0.0, position=Position(*offset_position(50.0, 8.0, *here))
                 )
                 place_map.add(frame, technique.encode(image))
-    found, _ = refined_of(tmp_path / "m.gpkg", folder / "ref")
+    found, _ = refine_copy(tmp_path / "m.gpkg", folder / "ref")
     assert (found.refined, found.contradictory) == (19, ())
     assert found.moved_m < 1.0
     assert found.ties > 65, "of a hundred pairs many overlap by a strip only"
 
 
-def test_refine_leaves_surveyed_places_unchanged(built, tmp_path):
-    with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
+def test_refine_leaves_surveyed_places_unchanged(unrefined_map, tmp_path):
+    with PlaceMap.open(unrefined_map) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
         lies = Pose(up_deg=0.0, footprint_m=80.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
         (first, *_) = there.read_places([1])
         descriptor = create_technique(there).encode(np.zeros((64, 64), np.uint8))
         frame = Frame(image=np.zeros((8, 8), np.uint8), name="1", t_mono_s=0.0, position=first.position, pose=lies)
         place_map.add(frame, descriptor)
-    found, (place,) = refined_of(tmp_path / "m.gpkg")
+    found, (place,) = refine_copy(tmp_path / "m.gpkg")
     assert (found.surveyed, found.refined) == (1, 0)
     assert place.pose == lies
 
 
-def test_map_refine_explains_why_a_map_cannot_be_refined(tmp_path, flown, map_path, capsys):
+def test_map_refine_explains_why_a_map_cannot_be_refined(tmp_path, flown_dir, map_path, capsys):
     path = tmp_path / "hog.gpkg"
-    assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
+    assert main(["map", "build", str(path), "--images", str(flown_dir[0] / "images"), "--technique", "hog"]) == 0
     assert "refined:" not in capsys.readouterr().out, "a map of another kind is built as it was"
     assert "--camera nadir" in refused(capsys, "map", "refine", path)
 

@@ -29,7 +29,7 @@ STATE = MotionState(
 )
 
 
-class Ear(Listener):
+class RecordingListener(Listener):
     """Counts autopilots, notes channels and forces, and gives a `state` and a fix `between` matches."""
 
     def __init__(self):

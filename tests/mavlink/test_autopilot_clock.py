@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from conversing import Autopilot, Ear
+from conversing import Autopilot, RecordingListener
 
 from edgevpr.mavlink.channel import Channel, ChannelChoice
 from edgevpr.mavlink.clock import AutopilotClock
@@ -17,7 +17,7 @@ WRAP_MS = 2**32
 
 def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
     """An autopilot that booted 400 s ago, when our clock stood at 600 s, and that a channel has been chosen for."""
-    autopilot = Autopilot(firmware, booted_s=600.0, listener=Ear())
+    autopilot = Autopilot(firmware, booted_s=600.0, listener=RecordingListener())
     autopilot.conversation.autopilot.selector._decision = Decision(ChannelChoice(channel, "for a test", 1, lag_s))
     autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
     return autopilot
@@ -62,7 +62,7 @@ def test_gps_input_has_boot_time_and_utc_without_link_jitter():
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT, Channel.ODOMETRY])
 def test_link_sends_no_timestamps_without_a_recent_time_from_the_autopilot(channel, caplog):
     name = {Channel.COMMAND: "COMMAND_INT", Channel.GPS_INPUT: "GPS_INPUT", Channel.ODOMETRY: "ODOMETRY"}[channel]
-    autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=Ear())
+    autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=RecordingListener())
     sent_after_s = []
     for step in range(80):
         autopilot.conversation.autopilot.selector._decision = Decision(ChannelChoice(channel, "for a test", 1))
@@ -78,7 +78,7 @@ def test_link_sends_no_timestamps_without_a_recent_time_from_the_autopilot(chann
     assert caplog.text.count("does not answer TIMESYNC") == 1
 
 
-def learnt(*trips, start_s=1000.0):
+def learn(*trips, start_s=1000.0):
     """A clock that has learnt by round trips a second apart, each (seconds to it, seconds back), from an autopilot
     whose boot was at 600 s."""
     clock = AutopilotClock()
@@ -92,9 +92,9 @@ def learnt(*trips, start_s=1000.0):
 
 def test_boot_time_s_uses_the_shortest_round_trip_of_ten_seconds():
     slow, quick = (0.4, 0.01), (0.004, 0.002)
-    assert learnt(slow).boot_time_s(1000.0) == pytest.approx(400.195)
-    assert learnt(slow, quick, slow).boot_time_s(1000.0) == pytest.approx(400.001)
-    assert learnt(quick, *[slow] * 12).boot_time_s(1000.0) == pytest.approx(400.195)
+    assert learn(slow).boot_time_s(1000.0) == pytest.approx(400.195)
+    assert learn(slow, quick, slow).boot_time_s(1000.0) == pytest.approx(400.001)
+    assert learn(quick, *[slow] * 12).boot_time_s(1000.0) == pytest.approx(400.195)
     assert AutopilotClock().boot_time_s(1.0) is None
 
 
@@ -111,7 +111,7 @@ def test_handle_ignores_an_unrequested_answer():
 
 def test_handle_replaces_older_answers_that_a_new_one_contradicts():
     """As after a pause of a simulated autopilot, or of our computer."""
-    clock = learnt((0.001, 0.001), (0.001, 0.001))
+    clock = learn((0.001, 0.001), (0.001, 0.001))
     request = clock.make_request(1002.0)
     assert not clock.handle(mavlink.MAVLink_timesync_message(round(401.5e9), request.ts1), 1002.2)
     assert clock.boot_time_s(1002.1) == pytest.approx(401.5)
@@ -134,7 +134,7 @@ def test_handle_recognises_another_boot_by_a_decreasing_boot_time_except_at_its_
     assert clock.handle(mavlink.MAVLink_attitude_message(then_ms, 0, 0, 0, 0, 0, 0), 1001.0) is has_restarted
 
 
-def foreign(kind, stamp_s):
+def make_foreign_message(kind, stamp_s):
     time_us = round(stamp_s * 1e6)
     if kind == "LANDING_TARGET":
         return mavlink.MAVLink_landing_target_message(time_us, 0, 8, 0, 0, 0, 0, 0)
@@ -146,16 +146,16 @@ def foreign(kind, stamp_s):
 @pytest.mark.parametrize("kind", ["LANDING_TARGET", "VISION_POSITION_ESTIMATE", "43003"])
 def test_timestamps_of_others_in_another_time_base_are_reported_once(kind, caplog):
     autopilot = Autopilot(booted_s=600.0)
-    autopilot.say(foreign(kind, autopilot.boot_s - 0.4), component_id=191)
-    autopilot.say(foreign(kind, 1.7e9), component_id=1)
+    autopilot.say(make_foreign_message(kind, autopilot.boot_s - 0.4), component_id=191)
+    autopilot.say(make_foreign_message(kind, 1.7e9), component_id=1)
     assert autopilot.texts() == []
     for _ in range(3):
-        autopilot.say(foreign(kind, 1.7e9), component_id=191)
+        autopilot.say(make_foreign_message(kind, 1.7e9), component_id=191)
     texts = [text for _, text in autopilot.texts()]
     assert texts == [make_status_text(Severity.WARNING, f"edgevpr: bad timestamps: 7/191 {kind}").text]
     assert caplog.text.count("differ from the autopilot's time") == 1
     px4 = Autopilot(PX4)
-    px4.say(foreign(kind, 1.7e9), component_id=191)
+    px4.say(make_foreign_message(kind, 1.7e9), component_id=191)
     assert px4.texts() == [], "which converts each sender's own clock"
 
 
@@ -222,7 +222,7 @@ def test_put_back_sends_ardupilot_the_position_at_its_assumed_delay(age_s, forei
         autopilot.wait(0.5)
         autopilot.position(50.0 + north_deg * autopilot.boot_s, vx=2000)
         if foreign_s:
-            autopilot.say(foreign("LANDING_TARGET", foreign_s), component_id=191)
+            autopilot.say(make_foreign_message("LANDING_TARGET", foreign_s), component_id=191)
             link.correct(foreign_s, autopilot.boot_s)
         frame_s = autopilot.boot_s - age_s
         fix = Fix(50.0 + north_deg * frame_s, 8.0, 5.0, autopilot.clock.now_s - age_s)

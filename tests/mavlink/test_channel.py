@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conversing import STATE, Autopilot, Ear
+from conversing import STATE, Autopilot, RecordingListener
 from simulated.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
 from simulated.firmware import PX4 as PX4_PARAMETERS
 
@@ -29,9 +29,9 @@ def test_choose_ardupilot_channel_uses_our_receiver_and_its_configured_delay():
     assert (first.receiver, first.lag_s) == (0, 0.06)
 
 
-def interviewed(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):
+def interview(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):
     """An autopilot with `parameters` beside those of its firmware, once it has answered; and the listener."""
-    ear = Ear()
+    ear = RecordingListener()
     autopilot = Autopilot(firmware, listener=ear, origin=origin)
     autopilot.conversation.request_position()
     for _ in range(seconds * 4):
@@ -41,7 +41,7 @@ def interviewed(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):
     return autopilot, ear
 
 
-def sent(autopilot, name, seconds=1.0):
+def collect(autopilot, name, seconds=1.0):
     """The messages of this name that are sent meanwhile."""
     messages = []
     for _ in range(round(seconds * 40)):
@@ -51,14 +51,14 @@ def sent(autopilot, name, seconds=1.0):
 
 
 def test_copter_with_our_receiver_gets_ten_positions_a_second():
-    autopilot, ear = interviewed(GPS2_TYPE=14)
+    autopilot, ear = interview(GPS2_TYPE=14)
     assert ear.channels == [Channel.NONE, Channel.GPS_INPUT]
-    positions = sent(autopilot, "GPS_INPUT", 2.0)
+    positions = collect(autopilot, "GPS_INPUT", 2.0)
     assert len(positions) == pytest.approx(20, abs=1)
     assert {(each.gps_id, each.lat, each.time_week, each.fix_type) for each in positions} == {(1, 470_000_000, 0, 3)}
     autopilot.say(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 0))
     ear.state = None
-    last = sent(autopilot, "GPS_INPUT")[-1]
+    last = collect(autopilot, "GPS_INPUT")[-1]
     assert (last.fix_type, last.time_week) == (mavlink.GPS_FIX_TYPE_NO_FIX, 2288)
     # What the receiver says that is us is no GPS; what the other says is.
     autopilot.gps(message=mavlink.MAVLink_gps2_raw_message)
@@ -68,25 +68,25 @@ def test_copter_with_our_receiver_gets_ten_positions_a_second():
 
 
 def test_odometry_waits_for_an_origin_and_sets_one_if_allowed():
-    autopilot, ear = interviewed(VISO_TYPE=1, EK3_SRC2_POSXY=6, origin=Position(46.5, 7.5, 400.0))
+    autopilot, ear = interview(VISO_TYPE=1, EK3_SRC2_POSXY=6, origin=Position(46.5, 7.5, 400.0))
     assert ear.channels == [Channel.NONE, Channel.ODOMETRY]
-    assert sent(autopilot, "ODOMETRY", 2.0) == []
+    assert collect(autopilot, "ODOMETRY", 2.0) == []
     for _ in range(2):
         autopilot.beat()
-        sent(autopilot, "ODOMETRY", 4.0)
+        collect(autopilot, "ODOMETRY", 4.0)
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 2, "the first one may be too early"
     autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
     autopilot.beat()
-    assert len(sent(autopilot, "ODOMETRY")) == pytest.approx(10, abs=1)
+    assert len(collect(autopilot, "ODOMETRY")) == pytest.approx(10, abs=1)
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 2
 
 
 def test_origin_without_altitude_uses_the_pressure_altitude():
-    autopilot, ear = interviewed(VISO_TYPE=1, seconds=6, origin=Position(46.5, 7.5))
+    autopilot, ear = interview(VISO_TYPE=1, seconds=6, origin=Position(46.5, 7.5))
     asked = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
     for _ in range(4):
         autopilot.beat()
-        requests = [message for message in sent(autopilot, "COMMAND_LONG", 4.0) if message.param1 == asked]
+        requests = [message for message in collect(autopilot, "COMMAND_LONG", 4.0) if message.param1 == asked]
     assert requests
     assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
     autopilot.say(mavlink.MAVLink_scaled_pressure_message(0, 945.0, 0, 2000))
@@ -107,11 +107,11 @@ def test_origin_without_altitude_uses_the_pressure_altitude():
         assert autopilot.vehicle.height_m == 116.0
         ear.state = replace(STATE, alt_m=autopilot.vehicle.alt_m)
         autopilot.beat()
-        assert sent(autopilot, "ODOMETRY")[-1].z == pytest.approx(-116.0, abs=0.01)
+        assert collect(autopilot, "ODOMETRY")[-1].z == pytest.approx(-116.0, abs=0.01)
 
 
 def test_conversation_reads_accelerations_together_with_the_attitude():
-    autopilot, ear = interviewed()
+    autopilot, ear = interview()
     autopilot.say(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
     assert ear.forces == []
     autopilot.attitude(roll_deg=28.65)
@@ -122,27 +122,27 @@ def test_conversation_reads_accelerations_together_with_the_attitude():
 
 
 def test_px4_gets_ten_positions_a_second_and_none_if_unknown():
-    autopilot, ear = interviewed(PX4)
-    said = sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0)
+    autopilot, ear = interview(PX4)
+    said = collect(autopilot, "GLOBAL_POSITION_SENSOR", 3.0)
     assert len(said) == pytest.approx(30, abs=1)
     assert said[0].lat == round(STATE.lat_deg * 1e7)
     ear.state = None
-    assert sent(autopilot, "GLOBAL_POSITION_SENSOR", 3.0) == []
+    assert collect(autopilot, "GLOBAL_POSITION_SENSOR", 3.0) == []
 
 
 def test_px4_with_odometry_is_asked_for_its_origin_and_sent_positions_relative_to_it():
-    autopilot, _ = interviewed(PX4, EKF2_AGP0_CTRL=0, EKF2_EV_CTRL=1, origin=Position(46.5, 7.5, 400.0))
-    assert sent(autopilot, "ODOMETRY", 3.0) == []
+    autopilot, _ = interview(PX4, EKF2_AGP0_CTRL=0, EKF2_EV_CTRL=1, origin=Position(46.5, 7.5, 400.0))
+    assert collect(autopilot, "ODOMETRY", 3.0) == []
     assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
     wanted = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
     asks = []
     for _ in range(6):
         autopilot.beat()
-        asks += [said.param1 for said in sent(autopilot, "COMMAND_LONG") if said.command == 512]
+        asks += [said.param1 for said in collect(autopilot, "COMMAND_LONG") if said.command == 512]
     assert wanted in asks
     autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
     autopilot.beat()
-    said = sent(autopilot, "ODOMETRY", 3.0)
+    said = collect(autopilot, "ODOMETRY", 3.0)
     assert len(said) == pytest.approx(30, abs=1)
     east_m, north_m = offset_m(46.5, 7.5, STATE.lat_deg, STATE.lon_deg)
     assert (said[0].x, said[0].y, said[0].z) == pytest.approx((north_m, east_m, 400 - STATE.alt_m), rel=1e-5)
@@ -150,7 +150,7 @@ def test_px4_with_odometry_is_asked_for_its_origin_and_sent_positions_relative_t
     assert said[0].pose_covariance[0] == said[0].pose_covariance[6] == pytest.approx(STATE.accuracy_m**2)
     assert np.isnan([*said[0].q, said[0].vx, said[0].vy, said[0].vz]).all(), "its own are better"
     for flags in (GLOBAL | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL, GLOBAL):
-        sent(autopilot, "ODOMETRY", 0.5)
+        collect(autopilot, "ODOMETRY", 0.5)
         autopilot.px4_filter(2.0, flags)
     assert autopilot.conversation.autopilot.px4.used_share == 0.5
 
@@ -162,7 +162,7 @@ FUSES = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 def test_px4_receiver_that_is_not_used_does_not_count_as_gps():
     """With EKF2_GPS_CTRL=0 the receiver goes on, near where the aircraft is."""
-    autopilot, ear = interviewed(PX4)
+    autopilot, ear = interview(PX4)
     ear.state = None
 
     def has_gps_after(seconds, flags):
@@ -179,22 +179,22 @@ def test_px4_receiver_that_is_not_used_does_not_count_as_gps():
     assert has_gps_after(1, GLOBAL | FUSES), "it uses it again"
     assert not has_gps_after(4, GLOBAL)
     ear.state = STATE
-    sent(autopilot, "GLOBAL_POSITION_SENSOR")
+    collect(autopilot, "GLOBAL_POSITION_SENSOR")
     assert not has_gps_after(3, GLOBAL | FUSES), "what it fuses is ours"
 
 
 def test_conversation_sends_a_fix_between_matches_after_half_a_second():
-    autopilot, ear = interviewed()
-    assert sent(autopilot, "COMMAND_INT", 3.0) == []
+    autopilot, ear = interview()
+    assert collect(autopilot, "COMMAND_INT", 3.0) == []
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)
     autopilot.beat()
-    assert [each.x for each in sent(autopilot, "COMMAND_INT", 1.8)] == [470_000_000] * 4
+    assert [each.x for each in collect(autopilot, "COMMAND_INT", 1.8)] == [470_000_000] * 4
     assert len(autopilot.conversation.take_interim_fixes()) == 4
     assert autopilot.conversation.take_interim_fixes() == []
     autopilot.beat()
     autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
-    assert [each.x for each in sent(autopilot, "COMMAND_INT", 0.4)] == [500_000_000], "a match has just been sent"
-    autopilot, ear = interviewed(PX4, EKF2_AGP0_CTRL=0)
+    assert [each.x for each in collect(autopilot, "COMMAND_INT", 0.4)] == [500_000_000], "a match has just been sent"
+    autopilot, ear = interview(PX4, EKF2_AGP0_CTRL=0)
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)
     autopilot.beat()
-    assert sent(autopilot, "COMMAND_INT", 4.0) == [], "its velocity follows a fix"
+    assert collect(autopilot, "COMMAND_INT", 4.0) == [], "its velocity follows a fix"

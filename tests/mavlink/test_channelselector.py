@@ -17,7 +17,7 @@ COPTER = ARDUPILOT | {"GPS2_TYPE": 14}
 STEP_S = 0.1
 
 
-class Asked(Autopilot):
+class ParamPilot(Autopilot):
     """An autopilot that is asked where it is, and notes which parameters, when."""
 
     def __init__(self, parameters, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, **link):
@@ -55,13 +55,13 @@ class Asked(Autopilot):
         return self.conversation.autopilot.selector
 
 
-def loses(share, seed=1):
+def lose(share, seed=1):
     dice = random.Random(seed)
     return lambda message: dice.random() < share
 
 
 def test_selector_requests_end_once_all_parameters_are_known():
-    autopilot = Asked(COPTER)
+    autopilot = ParamPilot(COPTER)
     assert autopilot.answer_for(10, Channel.GPS_INPUT) < 5
     autopilot.answer_for(10)
     known = {message.param_id for message in autopilot.sent if message.get_type() == "PARAM_REQUEST_READ"}
@@ -70,7 +70,7 @@ def test_selector_requests_end_once_all_parameters_are_known():
 
 
 def test_selector_requests_at_most_ten_at_growing_intervals_without_answers():
-    autopilot = Asked(COPTER, is_lost=lambda message: True)
+    autopilot = ParamPilot(COPTER, is_lost=lambda message: True)
     autopilot.answer_for(300)
     count = Counter(t_s for t_s, _ in autopilot.requests)
     assert max(count.values()) <= 10
@@ -81,7 +81,7 @@ def test_selector_requests_at_most_ten_at_growing_intervals_without_answers():
 
 
 def test_answers_after_eight_seconds_of_silence_choose_the_channel():
-    autopilot = Asked(COPTER)
+    autopilot = ParamPilot(COPTER)
     autopilot.link["is_lost"] = lambda message: autopilot.clock.now_s - autopilot.begin_s < 8
     autopilot.answer_for(8)
     assert autopilot.conversation.channel is Channel.NONE
@@ -93,7 +93,7 @@ def test_parameters_that_the_autopilot_lacks_are_absent_after_some_rounds(firmwa
     parameters = {name: value for name, value in COPTER.items() if not name.startswith("VISO")}
     if firmware == "old":
         parameters = {OLD_NAMES.get(name, name): value for name, value in parameters.items()}
-    autopilot = Asked(parameters)
+    autopilot = ParamPilot(parameters)
     autopilot.answer_for(2)
     assert autopilot.conversation.channel is Channel.NONE, "VISO_TYPE may have been lost"
     assert autopilot.answer_for(30, Channel.GPS_INPUT) < 15
@@ -101,7 +101,7 @@ def test_parameters_that_the_autopilot_lacks_are_absent_after_some_rounds(firmwa
 
 def test_selector_treats_a_nonexistent_parameter_as_absent_at_once():
     px4 = {name: value for name, value in PX4.items() if "AGP" not in name}
-    autopilot = Asked(px4, mavlink.MAV_AUTOPILOT_PX4, errors=True)
+    autopilot = ParamPilot(px4, mavlink.MAV_AUTOPILOT_PX4, errors=True)
     assert autopilot.answer_for(10, Channel.COMMAND) < 2
 
 
@@ -109,7 +109,7 @@ def test_selector_treats_a_nonexistent_parameter_as_absent_at_once():
 def test_selector_does_not_treat_a_parameter_with_lost_answers_as_absent(share):
     """What is asked for in vain is on a link that loses as much else no proof that it is not there."""
     for seed in range(5):
-        autopilot = Asked(COPTER | {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, is_lost=loses(share, seed))
+        autopilot = ParamPilot(COPTER | {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, is_lost=lose(share, seed))
         autopilot.answer_for(40)
         assert autopilot.conversation.channel is Channel.NONE
         assert autopilot.selector.choice.reason.parameters["changes"] == "GPS_PRIMARY=0"
@@ -117,7 +117,7 @@ def test_selector_does_not_treat_a_parameter_with_lost_answers_as_absent(share):
 
 
 def test_selector_reports_missing_answers_once_and_withholds_fixes():
-    autopilot = Asked(COPTER, is_lost=lambda message: message.param_id not in ("GPS1_TYPE", "AHRS_EKF_TYPE"))
+    autopilot = ParamPilot(COPTER, is_lost=lambda message: message.param_id not in ("GPS1_TYPE", "AHRS_EKF_TYPE"))
     autopilot.answer_for(1)
     autopilot.link["is_lost"] = lambda message: True
     autopilot.answer_for(30)
@@ -133,7 +133,7 @@ def test_selector_reports_missing_answers_once_and_withholds_fixes():
 
 
 def test_selector_stops_the_channel_while_a_parameter_is_dangerous():
-    autopilot = Asked(COPTER)
+    autopilot = ParamPilot(COPTER)
     autopilot.answer_for(10)
     autopilot.set(GPS_PRIMARY=1)
     assert autopilot.conversation.channel is Channel.GPS_INPUT
@@ -148,7 +148,7 @@ def test_selector_stops_the_channel_while_a_parameter_is_dangerous():
 
 
 def test_selector_notices_an_unannounced_change_within_two_minutes():
-    autopilot = Asked(COPTER)
+    autopilot = ParamPilot(COPTER)
     autopilot.answer_for(10)
     autopilot.parameters["EK3_AFFINITY"] = 1
     assert autopilot.answer_for(130, Channel.NONE) < 125
@@ -158,14 +158,14 @@ def test_selector_notices_an_unannounced_change_within_two_minutes():
 
 
 def test_selector_reports_a_weak_parameter_once():
-    autopilot = Asked(PX4 | {"EKF2_GPS_CTRL": 0}, mavlink.MAV_AUTOPILOT_PX4)
+    autopilot = ParamPilot(PX4 | {"EKF2_GPS_CTRL": 0}, mavlink.MAV_AUTOPILOT_PX4)
     autopilot.answer_for(120)
     assert autopilot.conversation.channel is Channel.SENSOR
     assert autopilot.sentences() == [(Severity.WARNING, "edgevpr: set EKF2_GPS_CTRL=7: see the log")]
 
 
 def test_selector_uses_the_command_at_once_with_unknown_firmware():
-    autopilot = Asked({}, mavlink.MAV_AUTOPILOT_GENERIC)
+    autopilot = ParamPilot({}, mavlink.MAV_AUTOPILOT_GENERIC)
     autopilot.answer_for(60)
     assert autopilot.conversation.channel is Channel.COMMAND
     assert autopilot.requests == []

@@ -26,7 +26,7 @@ def fixes():
     return Fixes()
 
 
-def sent(fixes, *times_s):
+def send(fixes, *times_s):
     """Send a fix at each time; give the last."""
     for t_s in times_s:
         sending = FixTransmission(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
@@ -35,7 +35,7 @@ def sent(fixes, *times_s):
     return sending
 
 
-def hear(fixes, result, t_s):
+def answer_fix(fixes, result, t_s):
     """Let an autopilot that has GPS answer."""
     return fixes.handle(result, Readiness(has_gps=True).explain(result), t_s)
 
@@ -43,9 +43,9 @@ def hear(fixes, result, t_s):
 def test_fixes_get_their_own_answers_at_one_a_second_despite_losses(fixes):
     sendings = []
     for t_s in range(10):
-        sendings.append(sent(fixes, t_s))
+        sendings.append(send(fixes, t_s))
         if t_s not in (3, 4):
-            hear(fixes, "ACCEPTED" if t_s % 2 else "FAILED", t_s + 0.02)
+            answer_fix(fixes, "ACCEPTED" if t_s % 2 else "FAILED", t_s + 0.02)
     answers = [sending.answer for sending in sendings]
     assert answers == [None if t_s in (3, 4) else ("ACCEPTED" if t_s % 2 else "FAILED") for t_s in range(10)]
     assert sendings[3].outcome == sendings[4].outcome == LATE
@@ -54,35 +54,35 @@ def test_fixes_get_their_own_answers_at_one_a_second_despite_losses(fixes):
 
 
 def test_fixes_ignore_late_and_extra_answers(fixes):
-    first, second, third = (sent(fixes, t_s) for t_s in (-3.0, -2.8, -2.6))
-    assert hear(fixes, "FAILED", -2.5) is first
-    assert hear(fixes, "ACCEPTED", -2.4) is second
-    assert hear(fixes, "ACCEPTED", -2.3) is third
-    late = sent(fixes, 0.0)
-    assert hear(fixes, "FAILED", 1.1) is None
+    first, second, third = (send(fixes, t_s) for t_s in (-3.0, -2.8, -2.6))
+    assert answer_fix(fixes, "FAILED", -2.5) is first
+    assert answer_fix(fixes, "ACCEPTED", -2.4) is second
+    assert answer_fix(fixes, "ACCEPTED", -2.3) is third
+    late = send(fixes, 0.0)
+    assert answer_fix(fixes, "FAILED", 1.1) is None
     assert late.outcome == LATE
-    new = sent(fixes, 2.0)
-    assert hear(fixes, "FAILED", 2.1) is new
-    assert hear(fixes, "FAILED", 2.1) is None
+    new = send(fixes, 2.0)
+    assert answer_fix(fixes, "FAILED", 2.1) is new
+    assert answer_fix(fixes, "FAILED", 2.1) is None
     assert fixes.unanswered == 1
 
 
 def test_fixes_may_affect_the_position_unless_refused(fixes):
     assert fixes.t_fix_s == -math.inf
-    sent(fixes, 10.0)
+    send(fixes, 10.0)
     assert fixes.t_fix_s == 10.0, "it may be taken before the answer comes"
-    hear(fixes, "FAILED", 10.1)
+    answer_fix(fixes, "FAILED", 10.1)
     assert fixes.t_fix_s == -math.inf
-    sent(fixes, 11.0)
-    hear(fixes, "ACCEPTED", 11.1)
+    send(fixes, 11.0)
+    answer_fix(fixes, "ACCEPTED", 11.1)
     assert fixes.t_fix_s == 11.1
-    sent(fixes, 12.0)
-    hear(fixes, "DENIED", 12.1)
+    send(fixes, 12.0)
+    answer_fix(fixes, "DENIED", 12.1)
     assert fixes.t_fix_s == 11.1
-    sent(fixes, 13.0)
+    send(fixes, 13.0)
     fixes.expire_unanswered(14.1)
     assert fixes.t_fix_s == 13.0, "only the answer may have been lost"
-    sent(fixes, 15.0)
+    send(fixes, 15.0)
     fixes.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
     assert fixes.t_fix_s == 15.0
 
@@ -90,12 +90,12 @@ def test_fixes_may_affect_the_position_unless_refused(fixes):
 def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop():
     reports = []
     fixes = Fixes(announce=lambda *report: reports.append(report))
-    sent(fixes, 0, 1, 2, 3, 4)
+    send(fixes, 0, 1, 2, 3, 4)
     fixes.record_lost(3)
     assert fixes.find_objection(5.0) is None
-    sent(fixes, 5, 6, 7)
+    send(fixes, 5, 6, 7)
     fixes.report_silence(SILENT, 8.5)
-    sent(fixes, 17.5)
+    send(fixes, 17.5)
     fixes.record_lost(2)
     fixes.report_silence(SILENT, 20.0)
     assert fixes.find_objection(20.0) == UNANSWERED

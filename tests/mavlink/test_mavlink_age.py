@@ -24,7 +24,7 @@ from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-THROWN_AWAY = Reason(ReasonCode.LINK_LOST)
+DROPPED = Reason(ReasonCode.LINK_LOST)
 
 
 @pytest.fixture
@@ -45,11 +45,11 @@ def line(narrow_server, clock):
     line.port.close()
 
 
-def sending(clock):
+def make_transmission(clock):
     return FixTransmission(Fix(50.0, 8.0, 20.0, clock.now_s), clock.now_s + 1.0)
 
 
-def hold_up(line) -> None:
+def fill_system_buffer(line) -> None:
     """Write until the system holds bytes that the other end does not take."""
     while line.port.unsent() < 2000:
         line.put(bytes(100), None)
@@ -57,7 +57,7 @@ def hold_up(line) -> None:
         assert not line.unsent
 
 
-def drained(port: socket.socket) -> bytes:
+def drain(port: socket.socket) -> bytes:
     got = b""
     try:
         while data := port.recv(65_536):
@@ -69,8 +69,8 @@ def drained(port: socket.socket) -> bytes:
 
 def test_tcp_link_closes_with_an_outdated_fix_in_the_system_buffer(line, clock):
     line, far = line
-    hold_up(line)
-    fix = sending(clock)
+    fill_system_buffer(line)
+    fix = make_transmission(clock)
     line.put(b"the fix", fix)
     line.write()
     assert not line.unsent
@@ -80,8 +80,8 @@ def test_tcp_link_closes_with_an_outdated_fix_in_the_system_buffer(line, clock):
     with pytest.raises(ConnectionError, match="too long"):
         line.take_sent_fixes()
     assert line.close() == 1
-    assert (fix.sent, fix.why) == (False, THROWN_AWAY)
-    got = drained(far)
+    assert (fix.sent, fix.why) == (False, DROPPED)
+    got = drain(far)
     assert got
     assert b"the fix" not in got, "closing throws away what cannot leave"
 
@@ -96,7 +96,7 @@ def test_serial_link_drops_outdated_fixes_after_a_stall():
         termios.tcflow(slave, termios.TCOOFF)
         fix = link.send_fix(Fix(50.0, 8.0, 20.0, time.monotonic()))
         wait_until(lambda: fix.sent is not None, "giving up the fix")
-        assert (fix.sent, fix.why) == (False, THROWN_AWAY)
+        assert (fix.sent, fix.why) == (False, DROPPED)
         termios.tcflow(slave, termios.TCOON)
         peer.seen.clear()
         link.send(make_status_text(Severity.INFO, "goes on"))
@@ -110,7 +110,7 @@ def test_serial_link_drops_outdated_fixes_after_a_stall():
 BEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)
 
 
-def losses_told(caplog) -> int:
+def count_losses(caplog) -> int:
     told = [record.getMessage() for record in caplog.records if record.name == "edgevpr.mavlink.driver"]
     return sum("the device was disconnected" in message for message in told)
 
@@ -129,7 +129,7 @@ def test_serial_link_reopens_a_replugged_cable(tmp_path, caplog):
             link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
             wait_until(lambda times=times: link.stats().acks == {"ACCEPTED": times}, "the answer to the fix")
             cable.unplug()
-            wait_until(lambda times=times: losses_told(caplog) == times, "noticing the loss")
+            wait_until(lambda times=times: count_losses(caplog) == times, "noticing the loss")
             summary = autopilot.join()  # a cut line ends it
             assert (summary.companion, summary.fixes_accepted) == ("1/197", 1)
             assert (summary.bad_bytes, summary.lost_packets) == (0, 0)

@@ -6,7 +6,7 @@ from conversing import ARMED, Autopilot
 from edgevpr.mavlink.wire import mavlink
 
 GROUND_M = 584.0
-NOWHERE = 0.0, 0.0
+UNKNOWN_POSITION = 0.0, 0.0
 
 
 class Vehicle:
@@ -71,7 +71,7 @@ def vehicle():
     return vehicle
 
 
-def near(height_m):
+def approx_height(height_m):
     return pytest.approx(height_m, abs=1.0)
 
 
@@ -80,8 +80,8 @@ def test_height_starts_at_the_ground_wherever_home_is(home_m):
     vehicle = Vehicle()
     vehicle.home_m = home_m
     assert vehicle.fly() == 0.0
-    assert vehicle.take_off() == near(100.0)
-    assert vehicle.fly(20.0, climb_m_s=-2.0) == near(60.0)
+    assert vehicle.take_off() == approx_height(100.0)
+    assert vehicle.fly(20.0, climb_m_s=-2.0) == approx_height(60.0)
     assert vehicle.autopilot.vehicle.height_doubt_m == 0.0
     assert vehicle.texts() == []
 
@@ -90,7 +90,7 @@ def test_height_starts_at_the_ground_wherever_home_is(home_m):
 @pytest.mark.parametrize("climb_m_s", [0.0, 4.0])
 def test_height_is_unchanged_if_home_is_set_in_flight(vehicle, moved_m, climb_m_s):
     vehicle.home_m += moved_m
-    assert vehicle.fly(climb_m_s=climb_m_s) == near(vehicle.height_m)
+    assert vehicle.fly(climb_m_s=climb_m_s) == approx_height(vehicle.height_m)
     assert vehicle.texts() == []
     vehicle.is_armed = False
     assert vehicle.fly() == 0.0, "it stands on the ground"
@@ -99,22 +99,22 @@ def test_height_is_unchanged_if_home_is_set_in_flight(vehicle, moved_m, climb_m_
 @pytest.mark.parametrize("every_s", [0.1, 1.0, 12.0])
 def test_height_is_unchanged_if_the_origin_is_set_in_flight(vehicle, every_s):
     vehicle.home_m, vehicle.origin_m = vehicle.home_m + 300.0, 300.0
-    assert vehicle.fly(24.0, climb_m_s=0.5, every_s=every_s) == near(vehicle.height_m)
+    assert vehicle.fly(24.0, climb_m_s=0.5, every_s=every_s) == approx_height(vehicle.height_m)
     assert vehicle.texts() == []
 
 
 def test_height_is_known_if_the_position_arrives_in_flight():
     vehicle = Vehicle()
-    vehicle.at_deg = NOWHERE
+    vehicle.at_deg = UNKNOWN_POSITION
     assert vehicle.take_off() is None
     vehicle.at_deg, vehicle.home_m, vehicle.origin_m = (50.0, 8.0), GROUND_M + 90.0, 90.0
-    assert vehicle.fly() == near(100.0)
+    assert vehicle.fly() == approx_height(100.0)
 
 
 def test_height_ignores_an_altitude_jump_and_adds_uncertainty(vehicle):
     vehicle.origin_m = 40.0
-    assert vehicle.fly() == near(100.0)
-    assert vehicle.autopilot.vehicle.height_doubt_m == near(40.0)
+    assert vehicle.fly() == approx_height(100.0)
+    assert vehicle.autopilot.vehicle.height_doubt_m == approx_height(40.0)
     assert vehicle.texts() == ["altitude jumped +40 m"]
 
 
@@ -125,9 +125,9 @@ def test_height_follows_a_climb_missing_in_the_velocity(vehicle):
 def test_height_of_a_vehicle_first_seen_in_flight_starts_at_home():
     vehicle = Vehicle()
     vehicle.height_m, vehicle.is_armed = 100.0, True
-    assert vehicle.fly() == near(100.0)
+    assert vehicle.fly() == approx_height(100.0)
     vehicle.home_m += 80.0
-    assert vehicle.fly() == near(100.0)
+    assert vehicle.fly() == approx_height(100.0)
 
 
 def test_height_of_a_px4_without_home_is_reset_once_it_has_one():
@@ -135,12 +135,12 @@ def test_height_of_a_px4_without_home_is_reset_once_it_has_one():
     vehicle.height_m, vehicle.is_armed, vehicle.home_m = 100.0, True, 0.0
     vehicle.fly()
     vehicle.home_m = GROUND_M
-    assert vehicle.fly() == near(100.0)
+    assert vehicle.fly() == approx_height(100.0)
 
 
 def test_height_is_kept_by_a_disarmed_gliding_vehicle(vehicle):
     vehicle.is_armed = False
-    assert vehicle.fly(10.0, climb_m_s=-2.0) == near(80.0)
+    assert vehicle.fly(10.0, climb_m_s=-2.0) == approx_height(80.0)
 
 
 def test_height_over_terrain_is_independent_of_home():
@@ -148,9 +148,9 @@ def test_height_over_terrain_is_independent_of_home():
     vehicle.terrain_m = GROUND_M
     vehicle.take_off()
     vehicle.terrain_m = GROUND_M + 30.0
-    assert vehicle.fly() == near(70.0)
+    assert vehicle.fly() == approx_height(70.0)
     vehicle.home_m += 100.0
-    assert vehicle.fly() == near(70.0)
+    assert vehicle.fly() == approx_height(70.0)
 
 
 def test_height_contradicted_by_the_range_finder_is_reported_once():
@@ -166,7 +166,7 @@ def test_height_contradicted_by_the_range_finder_is_reported_once():
     assert heights.contradiction_m is None
     vehicle.range_m = 60.0
     assert vehicle.fly(6.0) == 60.0
-    assert vehicle.autopilot.vehicle.height_doubt_m == near(30.0)
+    assert vehicle.autopilot.vehicle.height_doubt_m == approx_height(30.0)
     assert vehicle.texts() == ["height 30 m, range finder 60 m"]
     vehicle.range_m = 31.0
     vehicle.fly(6.0)

@@ -20,24 +20,24 @@ def fix_at(t_frame_s: float, lat_deg: float = 50.0) -> Fix:
     return Fix(lat_deg, 14.0, 25.0, t_frame_s)
 
 
-def heard(link: Link, peer: Peer) -> None:
+def connect_autopilot(link: Link, peer: Peer) -> None:
     peer.heartbeat()
     wait_until(lambda: link.stats().autopilot_heard, "hearing the autopilot")
 
 
-def text(words: str):
+def make_text(words: str):
     return make_status_text(Severity.INFO, words)
 
 
 def test_link_sends_a_heartbeat_with_the_current_health_each_second(link, peer, clock):
     link.set_health(Health.ACTIVE)
     clock.now_s += 0.9
-    link.send(text("not yet"))
+    link.send(make_text("not yet"))
     assert peer.expect_text("not yet") == []
     clock.now_s += 0.2
     assert peer.expect("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
     clock.now_s += 0.8  # 1.9: the beat keeps its step
-    link.send(text("nor now"))
+    link.send(make_text("nor now"))
     assert peer.expect_text("nor now") == []
     clock.now_s += 0.1
     peer.expect("HEARTBEAT")
@@ -49,9 +49,9 @@ def test_link_sends_a_heartbeat_with_the_current_health_each_second(link, peer, 
 
 
 def test_link_uses_and_addresses_the_autopilots_system_id(link, peer, clock):
-    link.send(text("before"))
+    link.send(make_text("before"))
     assert peer.expect("STATUSTEXT").get_srcSystem() == 1
-    heard(link, peer)
+    connect_autopilot(link, peer)
     link.send_fix(fix_at(clock.now_s - 0.5, 50.1234567))
     fix = peer.expect("COMMAND_INT")
     assert (fix.get_srcSystem(), fix.get_srcComponent()) == (7, 197)
@@ -61,20 +61,20 @@ def test_link_uses_and_addresses_the_autopilots_system_id(link, peer, clock):
 
 
 def test_link_never_sends_an_outdated_fix_or_one_to_a_silent_autopilot(link, peer, clock):
-    heard(link, peer)
+    connect_autopilot(link, peer)
     link.send_fix(fix_at(clock.now_s - 5.1, 1.0))
     link.send_fix(fix_at(clock.now_s - 4.9, 2.0))
     assert peer.expect("COMMAND_INT").x == 20_000_000
     assert link.stats().dropped_stale_fixes == 1
     clock.now_s += 5.1
     link.send_fix(fix_at(clock.now_s))  # the autopilot has fallen silent
-    link.send(text("end"))
+    link.send(make_text("end"))
     assert "COMMAND_INT" not in [m.get_type() for m in peer.expect_text("end")]
     assert not link.stats().autopilot_heard
 
 
 def test_link_drops_only_a_message_whose_value_does_not_fit(link, peer, clock, caplog):
-    link.send(*make_named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), text("next"))
+    link.send(*make_named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), make_text("next"))
     assert [m.name for m in peer.expect_text("next")] == ["vpr_score"]
     assert "NAMED_VALUE_INT" in caplog.text
 
@@ -90,7 +90,7 @@ def test_udpout_link_accepts_only_its_peer(clock):
         stranger.to = port.to
         Peer(stranger, 7).heartbeat()
         stranger.send(b"hello")
-        heard(link, peer)
+        connect_autopilot(link, peer)
         stats = link.stats()
         assert (stats.received, stats.bad_bytes, stats.foreign_messages) == ({"HEARTBEAT": 1}, 0, 0)
 
@@ -101,7 +101,7 @@ def test_tcp_link_reconnects_to_a_restarted_server_without_old_fixes(clock):
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         peer = Peer(server.accept())
         peer.expect("HEARTBEAT")
-        heard(link, peer)
+        connect_autopilot(link, peer)
         peer.synchronise(link)
         peer.port.send(b"\xfd\xff\x00")  # dies in the middle of a message
         server.close()
@@ -128,7 +128,7 @@ def test_tcp_link_waits_for_an_absent_server_with_the_newest_messages(clock):
         assert not link.stats().connected
         assert link.stats().trouble == "Connection refused"
         for count in range(MAX_MESSAGES + 36):
-            link.send(text(f"{count}"))
+            link.send(make_text(f"{count}"))
         server = TcpServer(number)
         peer = Peer(server.accept())
         texts = [m.text for m in peer.expect_text(f"{MAX_MESSAGES + 35}") if m.get_type() == "STATUSTEXT"]
@@ -143,7 +143,7 @@ def test_tcp_link_is_never_blocked_by_a_peer_that_does_not_read(clock):
         server.accept()
 
         def stuck() -> bool:
-            link.send(*[text("x" * 50)] * MAX_MESSAGES)
+            link.send(*[make_text("x" * 50)] * MAX_MESSAGES)
             clock.now_s += 0.01
             return link.stats().trouble is not None
 
@@ -158,17 +158,17 @@ def test_tcp_link_is_never_blocked_by_a_peer_that_does_not_read(clock):
 def test_link_sends_nothing_once_closed_and_can_be_closed_twice(port, clock):
     link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
     link.start()
-    link.send(text("last"))
+    link.send(make_text("last"))
     link.close()
     assert len(Peer(port).expect_text("last")) == 1  # the heartbeat
-    link.send(text("late"))
+    link.send(make_text("late"))
     link.close()
     assert not link.stats().connected
     link_to("udpout:127.0.0.1:14550").close()  # never started
 
 
 def test_link_waits_for_the_last_answer_while_closing(link, peer, clock):
-    heard(link, peer)
+    connect_autopilot(link, peer)
     peer.synchronise(link)
     link.send_fix(fix_at(clock()))
     closing_link = threading.Thread(target=link.close)

@@ -57,26 +57,26 @@ class Signer:
         return message.pack(self.packer)
 
 
-def admitted(signing: Signing, *packets: bytes) -> list[bool]:
+def admit(signing: Signing, *packets: bytes) -> list[bool]:
     receiver = PacketReader(signing.admits)
     return [bool(list(receiver.feed(packet))) for packet in packets]
 
 
-def unsigned(message=HEARTBEAT) -> bytes:
+def make_unsigned(message=HEARTBEAT) -> bytes:
     return message.pack(mavlink.MAVLink(None, 7, 1))
 
 
 def test_signing_admits_signed_messages_in_order_and_once(signing):
     signer = Signer()
     first, second, third = (signer.packet() for _ in range(3))
-    assert admitted(signing, first, third, second, third, first) == [True, True, False, False, False]
+    assert admit(signing, first, third, second, third, first) == [True, True, False, False, False]
     assert signing.refused == {OLD: 3}
 
 
 def test_signing_forged_future_timestamp_does_not_block_valid_messages(signing, clock):
     signer = Signer()
     forged = Signer(OTHER_KEY).packet(2**48 - 1)
-    assert admitted(signing, signer.packet(), forged, signer.packet()) == [True, False, True]
+    assert admit(signing, signer.packet(), forged, signer.packet()) == [True, False, True]
     assert signing.refused == {WRONG: 1}
     packer = mavlink.MAVLink(None, 1, 197)
     signing.stamp(packer)
@@ -87,23 +87,23 @@ def test_signing_forged_future_timestamp_does_not_block_valid_messages(signing, 
 def test_signing_refuses_a_modified_message(signing, place):
     packet = bytearray(Signer().packet())
     packet[place] ^= 0x10
-    assert admitted(signing, packet) == [False]
+    assert admit(signing, packet) == [False]
 
 
 def test_signing_refuses_counts_and_reports_unsigned_messages_once(signing, caplog):
     old_protocol = HEARTBEAT.pack(mavlink.MAVLink(None, 7, 1), force_mavlink1=True)
-    assert not any(admitted(signing, unsigned(), unsigned(), old_protocol))
+    assert not any(admit(signing, make_unsigned(), make_unsigned(), old_protocol))
     assert signing.refused == {UNSIGNED: 3}
     assert caplog.text.count("does not sign") == 1
 
 
 def test_signing_accepts_unsigned_radio_status_but_not_as_the_autopilot(signing):
     message = mavlink.MAVLink_radio_status_message(1, 2, 3, 4, 5, 6, 7)
-    assert admitted(signing, message.pack(mavlink.MAVLink(None, 51, 68))) == [True]
+    assert admit(signing, message.pack(mavlink.MAVLink(None, 51, 68))) == [True]
     assert signing.refused == {}
-    assert admitted(signing, unsigned(message)) == [False]
+    assert admit(signing, make_unsigned(message)) == [False]
     assert signing.refused == {UNSIGNED: 1}
-    assert admitted(signing, Signer().packet(message=message)) == [True]
+    assert admit(signing, Signer().packet(message=message)) == [True]
 
 
 @pytest.mark.parametrize(
@@ -112,19 +112,19 @@ def test_signing_accepts_unsigned_radio_status_but_not_as_the_autopilot(signing)
 )
 def test_signing_requires_a_new_stream_within_a_minute(signing, ahead_s, refused):
     new = Signer(stamp=NOW + ahead_s * TICKS_S, link_id=1).packet()
-    admitted(signing, Signer().packet(), new)
+    admit(signing, Signer().packet(), new)
     assert signing.refused == refused
 
 
 def test_signing_first_stream_may_be_ahead_and_sets_the_time(signing, clock):
     """A board without a clock chip that was off for a week learns the time from the autopilot."""
     week = 7 * 86_400 * TICKS_S
-    assert admitted(signing, Signer(stamp=NOW + week).packet()) == [True]
+    assert admit(signing, Signer(stamp=NOW + week).packet()) == [True]
     packer = mavlink.MAVLink(None, 1, 197)
     clock.now_s += 5
     signing.stamp(packer)
     assert packer.signing.timestamp == NOW + week + 5 * TICKS_S
-    assert admitted(signing, Signer(stamp=NOW, link_id=1).packet()) == [False]
+    assert admit(signing, Signer(stamp=NOW, link_id=1).packet()) == [False]
 
 
 @pytest.fixture
@@ -169,15 +169,15 @@ def test_signing_autopilot_with_an_old_clock_learns_the_time_despite_an_earlier_
     number, day = free_port(), 86_400 * TICKS_S
     signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
     with link_to(f"udpin:127.0.0.1:{number}", signing=signing) as link, ExitStack() as stack:
-        stray, own, replaying = (stack.enter_context(closing(calling(number))) for _ in range(3))
-        stray.send(unsigned())
+        stray, own, replaying = (stack.enter_context(closing(make_socket(number))) for _ in range(3))
+        stray.send(make_unsigned())
         wait_until(lambda: link.stats().refused_signatures, "the stray packet")
         signer = Signer(stamp=int((time.time() - 1_420_070_400) * TICKS_S) - day)
         old = signer.packet()
 
         def beat() -> bool:
             own.send(signer.packet())
-            for message in PacketReader().feed(received(own)):
+            for message in PacketReader().feed(receive(own)):
                 signer.packer.signing.timestamp = int.from_bytes(message.get_msgbuf()[-12:-6], "little") + 1
             return link.stats().autopilot_heard
 
@@ -185,11 +185,11 @@ def test_signing_autopilot_with_an_old_clock_learns_the_time_despite_an_earlier_
         replaying.send(old)
         wait_until(lambda: link.stats().refused_signatures.get(OLD, 0) > 1, "refusing what is sent again")
         link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
-        wait_until(lambda: received(own), "the fix, not sent elsewhere")
-        assert received(replaying) == b""
+        wait_until(lambda: receive(own), "the fix, not sent elsewhere")
+        assert receive(replaying) == b""
 
 
-def calling(number: int) -> socket.socket:
+def make_socket(number: int) -> socket.socket:
     """A socket of its own address that sends to a port of this machine."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.connect(("127.0.0.1", number))
@@ -197,7 +197,7 @@ def calling(number: int) -> socket.socket:
     return sock
 
 
-def received(sock: socket.socket) -> bytes:
+def receive(sock: socket.socket) -> bytes:
     with suppress(BlockingIOError):
         return sock.recv(4096)
     return b""
@@ -215,7 +215,7 @@ def test_signing_without_a_key_admits_everything_and_signs_nothing():
     packer = mavlink.MAVLink(None)
     NOT_SIGNING.stamp(packer)
     assert not packer.signing.sign_outgoing
-    assert admitted(NOT_SIGNING, unsigned(), Signer(OTHER_KEY).packet()) == [True, True]
+    assert admit(NOT_SIGNING, make_unsigned(), Signer(OTHER_KEY).packet()) == [True, True]
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o610, 0o602, 0o440])

@@ -7,7 +7,7 @@ from conversing import Autopilot
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 
-def a_packet_of_every_kind(rng: random.Random, system_id: int = 1) -> list[bytes]:
+def make_packets_of_every_kind(rng: random.Random, system_id: int = 1) -> list[bytes]:
     packer = mavlink.MAVLink(None, system_id, 1)
     packets = []
     for kind in mavlink.mavlink_map.values():
@@ -18,7 +18,7 @@ def a_packet_of_every_kind(rng: random.Random, system_id: int = 1) -> list[bytes
 
 def test_damaged_packets_and_noise_never_raise_and_are_counted():
     rng = random.Random(2)
-    packets = a_packet_of_every_kind(rng)
+    packets = make_packets_of_every_kind(rng)
     receiver = PacketReader()
     for _ in range(5000):
         packet = bytearray(rng.choice(packets))
@@ -41,7 +41,7 @@ def test_damaged_packets_and_noise_never_raise_and_are_counted():
 def test_conversation_accepts_any_content_of_autopilot_messages():
     rng, autopilot = random.Random(3), Autopilot()
     for _ in range(10):
-        for packet in a_packet_of_every_kind(rng, system_id=7):
+        for packet in make_packets_of_every_kind(rng, system_id=7):
             autopilot.wait(0.01)
             autopilot.conversation.handle(packet, autopilot.clock.now_s, None)
         autopilot.put_fix()

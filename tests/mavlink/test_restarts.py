@@ -1,7 +1,7 @@
 """An autopilot that restarts is a new one, and one whose link is lost for some seconds is not."""
 
 import pytest
-from conversing import Autopilot, Ear
+from conversing import Autopilot, RecordingListener
 from simulated.firmware import ARDUPILOT
 
 from edgevpr.core.types import Position
@@ -18,7 +18,7 @@ class Aircraft(Autopilot):
     since the last restart, `rates` the messages that it was asked to stream."""
 
     def __init__(self, parameters, *, says_boot_time=True, booted_s=600.0, **settings):
-        self.parameters, self.ear = dict(parameters), Ear()
+        self.parameters, self.ear = dict(parameters), RecordingListener()
         self.says_boot_time, self.has_origin = says_boot_time, False
         super().__init__(booted_s=booted_s, listener=self.ear, origin=Position(46.5, 7.5, 400.0), **settings)
         self.conversation.request_position()

@@ -19,19 +19,19 @@ def path(tmp_path):
     return tmp_path / "time"
 
 
-def stamps_at(path, utc_s: float = 0.0, clock=None) -> TimeStamps:
+def make_stamps(path, utc_s: float = 0.0, clock=None) -> TimeStamps:
     """Those of a board whose clock stands at `utc_s`: 0 without a clock chip."""
     return TimeStamps(path, clock or FakeClock(), lambda: utc_s)
 
 
 def test_time_stamps_are_saved_every_half_minute_and_resume_a_minute_later(path):
     clock = FakeClock()
-    stamps = stamps_at(path, clock=clock)
+    stamps = make_stamps(path, clock=clock)
     for _ in range(200):
         clock.now_s += 1
         last = stamps.next()
     wait_until(lambda: last - int(path.read_text()) < 30 * TICKS_S, "keeping the time")
-    after = stamps_at(path)
+    after = make_stamps(path)
     assert after.next() >= last + MINUTE
     assert after.check(STREAM, last) == OLD, "a message of before was admitted after the restart"
 
@@ -47,7 +47,7 @@ def test_time_stamps_follow_a_clock_set_forward_but_not_one_set_back(path):
     assert stamps.next() == last + 1
 
 
-KILLED = """
+SCRIPT = """
 import sys, time
 from pathlib import Path
 from edgevpr.mavlink.signing import TimeStamps
@@ -63,7 +63,7 @@ while True:
 def test_time_stamps_never_decrease_after_kill_9(path):
     last = 0
     for lines in (1, 5000, 20_000):
-        with subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen([sys.executable, "-c", SCRIPT, str(path)], stdout=subprocess.PIPE, text=True) as process:
             first = last_before = int(process.stdout.readline())
             for _ in range(lines):
                 last_before = int(process.stdout.readline())
@@ -78,15 +78,15 @@ def test_time_stamps_never_decrease_after_kill_9(path):
 def test_time_stamps_refuse_an_invalid_or_unwritable_file_in_one_sentence(path, content):
     path.write_bytes(content)
     with pytest.raises(ConfigError, match="time"):
-        stamps_at(path)
+        make_stamps(path)
     assert path.read_bytes() == content
     with pytest.raises(ConfigError, match="signing_state"):
-        stamps_at(path.parent / "no-folder" / "time")
+        make_stamps(path.parent / "no-folder" / "time")
 
 
 def test_time_stamps_continue_on_a_full_disk(path, monkeypatch, caplog):
     clock = FakeClock()
-    stamps = stamps_at(path, clock=clock)
+    stamps = make_stamps(path, clock=clock)
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -99,12 +99,12 @@ def test_time_stamps_continue_on_a_full_disk(path, monkeypatch, caplog):
         clock.now_s += 60
         assert stamps.next() > first
     assert (len(tries), caplog.text.count("cannot save the signing timestamp (No space left on device)")) == (3, 1)
-    stamps_at(path)  # nor does it at the next start, where there is a time from before
+    make_stamps(path)  # nor does it at the next start, where there is a time from before
 
 
 def test_time_stamps_borrowed_from_a_file_leave_it_unchanged(path):
     clock = FakeClock()
-    flown = stamps_at(path, clock=clock).next()
+    flown = make_stamps(path, clock=clock).next()
     before = path.read_bytes()
     borrowed = TimeStamps(path, clock, lambda: 0.0, is_saved=False)
     assert borrowed.next() > flown
@@ -114,4 +114,4 @@ def test_time_stamps_borrowed_from_a_file_leave_it_unchanged(path):
     assert path.read_bytes() == before
     assert TimeStamps(path.with_name("absent"), is_saved=False).next() > 0
     assert list(path.parent.iterdir()) == [path]
-    assert stamps_at(path, clock=clock).next() < flown + 3600 * TICKS_S
+    assert make_stamps(path, clock=clock).next() < flown + 3600 * TICKS_S

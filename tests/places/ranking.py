@@ -34,7 +34,7 @@ def rank(technique, query, place_map, index, candidates=None, apart_m=0.0, in_re
     return compare_places(asked, scan_index(asked), candidates, apart_m)
 
 
-def index_of(place_ids) -> PlaceIndex:
+def make_index(place_ids) -> PlaceIndex:
     """An index of these places, somewhere."""
     index = allocate_index(Ruler.spec, len(place_ids), None)
     index.place_ids[:] = place_ids

@@ -102,7 +102,7 @@ def test_margin_is_to_the_best_place_elsewhere(ruler):
     assert margin(nowhere, index, 1e6) == pytest.approx(1 - 1 / 13), "without a position, neighbours are the two beside"
 
 
-def within(index, *numbers):
+def reach_only(index, *numbers):
     """Only the places of these numbers are in reach."""
     return np.isin(index.place_ids, [1 + number // 4 for number in numbers])
 
@@ -110,7 +110,7 @@ def within(index, *numbers):
 def test_places_out_of_reach_are_no_candidates(ruler):
     technique, place_map, index = ruler
     query = technique.encode(43)
-    allowed = within(index, *range(64, 100, 4))
+    allowed = reach_only(index, *range(64, 100, 4))
     technique.compared = 0
     ranking = rank(technique, query, place_map, index, candidates=3, in_reach=allowed)
     assert technique.compared == 3 + 5, "three in reach, and the five best-scanned of all others"
@@ -123,12 +123,12 @@ def test_places_out_of_reach_are_no_candidates(ruler):
 def test_retrieve_finds_rivals_in_the_whole_map_for_a_single_place_in_reach(ruler):
     technique, place_map, index = ruler
     query = technique.encode(20)
-    alone = rank(technique, query, place_map, index, 20, 40.0, within(index, 80))
+    alone = rank(technique, query, place_map, index, 20, 40.0, reach_only(index, 80))
     assert len(alone.slots) == 1 + 5
     # The picture shows another place: the one in reach must not be taken for want of it.
     assert load_candidates(alone, index, place_map, 1)[0].place.source_image == "20"
     assert margin(alone, index, 40.0) == pytest.approx(1 - 1 / 5)
-    right = rank(technique, technique.encode(80), place_map, index, 20, 40.0, within(index, 80))
+    right = rank(technique, technique.encode(80), place_map, index, 20, 40.0, reach_only(index, 80))
     assert load_candidates(right, index, place_map, 1)[0].place.source_image == "80"
     assert margin(right, index, 40.0) == pytest.approx(1 - 1 / 5)
 
@@ -148,7 +148,7 @@ def test_index_keeps_headings_and_finds_places_within_a_distance(tmp_path):
     assert index.find_within(Position(0.0, -179.999), 180.0).tolist() == [True, True, True, True, False, False]
 
 
-class Turned(Ruler):
+class RotatedRuler(Ruler):
     """A ruler that may have been turned in three ways, of which only the last one matches."""
 
     def __init__(self):
@@ -166,7 +166,7 @@ class Turned(Ruler):
 
 def test_match_gets_the_chosen_hypotheses_or_all_of_them(ruler):
     _, place_map, index = ruler
-    technique = Turned()
+    technique = RotatedRuler()
     query = technique.encode(43)
     few = rank(technique, query, place_map, index, 14)
     assert sum(len(hypotheses) for hypotheses in technique.tried) == 14
@@ -190,7 +190,7 @@ def test_match_gets_the_chosen_hypotheses_or_all_of_them(ruler):
     ids=["a large map", "a small map", "known headings", "few in reach"],
 )
 def test_retrieve_compares_more_places_of_a_large_map_without_a_heading(ruler_map, monkeypatch, large, known, compared):
-    class Tall(Turned):
+    class Tall(RotatedRuler):
         spec = dataclasses.replace(Ruler.spec, height_ratios=(1.0,))
 
         def score_places(self, query, rows, mean, **hints):
@@ -211,12 +211,12 @@ def test_retrieve_compares_more_places_from_two_thousand_on():
 def test_ranking_counts_the_rotations_not_ruled_out(ruler_map):
     _, place_map = ruler_map
 
-    class Known(Turned):
+    class Known(RotatedRuler):
         def score_places(self, query, rows, mean):
             scores, each = super().score_places(query, rows, mean)
             return scores, np.where([True, False, True], each, -np.inf)
 
-    class Tall(Turned):
+    class Tall(RotatedRuler):
         """Of places with an odd number, one of two rotations at one of two heights is left."""
 
         spec = dataclasses.replace(Ruler.spec, height_ratios=(0.8, 1.0))
@@ -227,12 +227,12 @@ def test_ranking_counts_the_rotations_not_ruled_out(ruler_map):
             is_left[1::2, 1:] = False
             return scores, np.where(is_left, scores[:, None], -np.inf)
 
-    for technique, tried in ((Turned(), 1.0), (Known(), 2 / 3), (Ruler(), 1.0), (Tall(), 0.75)):
+    for technique, tried in ((RotatedRuler(), 1.0), (Known(), 2 / 3), (Ruler(), 1.0), (Tall(), 0.75)):
         index = load_index(place_map, technique, 10_000)
         assert rank(technique, technique.encode(43), place_map, index, 14).tried == pytest.approx(tried)
 
 
-class Hasty(Ruler):
+class BiasedQuickRuler(Ruler):
     """A ruler with wrong first impressions: at a glance each number is five larger than it is."""
 
     spec = dataclasses.replace(Ruler.spec, max_matches=3)
@@ -247,7 +247,7 @@ class Hasty(Ruler):
 
 def test_retrieve_matches_the_candidates_with_the_best_quick_scores(ruler):
     _, place_map, index = ruler
-    technique = Hasty()
+    technique = BiasedQuickRuler()
     ranking = rank(technique, technique.encode(41), place_map, index, 8, 5.0)
     assert len(technique.glanced) == 8
     assert technique.compared == 3
@@ -262,7 +262,7 @@ def test_retrieve_matches_the_candidates_with_the_best_quick_scores(ruler):
 
 def test_retrieve_compares_a_rival_with_the_best_quick_score_elsewhere(ruler):
     _, place_map, index = ruler
-    technique = Hasty()
+    technique = BiasedQuickRuler()
     # All three that are compared are neighbours, within 150 m of 40: so five rivals are compared as well.
     ranking = rank(technique, technique.encode(41), place_map, index, 12, 150.0)
     assert technique.compared == 8
@@ -296,7 +296,7 @@ def test_retrieve_includes_the_scan_score_if_the_scan_counts(ruler, candidates):
 )
 def test_retrieve_skips_quick_scores_if_few_places_are_compared(ruler, usual, candidates, glanced, compared):
     _, place_map, index = ruler
-    technique = Hasty()
+    technique = BiasedQuickRuler()
     technique.candidates = usual
     rank(technique, technique.encode(41), place_map, index, candidates)
     assert (len(technique.glanced), technique.compared) == (glanced, compared)
@@ -304,8 +304,8 @@ def test_retrieve_skips_quick_scores_if_few_places_are_compared(ruler, usual, ca
 
 def test_retrieve_compares_five_places_out_of_reach_with_few_candidates(ruler):
     _, place_map, index = ruler
-    technique = Hasty()
-    rank(technique, technique.encode(41), place_map, index, 8, in_reach=within(index, *range(0, 60, 4)))
+    technique = BiasedQuickRuler()
+    rank(technique, technique.encode(41), place_map, index, 8, in_reach=reach_only(index, *range(0, 60, 4)))
     assert technique.compared == 3 + 5
 
 
@@ -315,19 +315,19 @@ def test_retrieve_compares_five_places_out_of_reach_with_few_candidates(ruler):
 )
 def test_retrieve_compares_rivals_if_no_candidate_is_one(ruler, candidates, apart_m, reach, compared):
     technique, place_map, index = ruler
-    in_reach = reach and within(index, *reach)
+    in_reach = reach and reach_only(index, *reach)
     ranking = rank(technique, technique.encode(41), place_map, index, candidates, apart_m, in_reach)
     assert len(ranking.slots) == technique.compared == compared
 
 
-class Unmoved(Ruler):
+class UnmovedRuler(Ruler):
     def match_at_rest(self, query, fine):
         return FineMatch(float(fine[0]))
 
 
 def test_match_unmoved_places_compares_a_few_places_across_the_map(ruler):
     _, place_map, index = ruler
-    technique = Unmoved()
+    technique = UnmovedRuler()
     query = Query(technique=technique, descriptor=technique.encode(0), place_map=place_map, index=index)
     place_map.left_out[25] = "gone"
     for apart_m, numbers in ((200.0, range(20, 96, 12)), (250.0, range(24, 96, 8))):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from map_writer import SPEC, descriptor, frame
-from ranking import index_of
+from ranking import make_index
 
 from edgevpr.core.types import Pose
 from edgevpr.places.layers import read_layers
@@ -40,15 +40,15 @@ def test_choose_footprint_prefers_slightly_smaller_places(tmp_path, seen_m, amon
 
 def test_narrow_search_excludes_places_of_other_footprints(tmp_path):
     found = layers(tmp_path / "m.gpkg", CUT)
-    whole = index_of([1, 2, 3, 4, 5, 9])  # 9 was learnt since
+    whole = make_index([1, 2, 3, 4, 5, 9])  # 9 was learnt since
     assert found.narrow_search(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
     assert found.narrow_search(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
     near = Expectation(in_reach=np.array([True, True, False, False, False, False]))
     assert found.narrow_search(near, whole, 150.0).in_reach.tolist() == [True, False, False, False, False, False]
     assert found.narrow_search(near, whole, None) is near
-    assert found.narrow_search(Expectation(), index_of([2, 3]), 150.0).in_reach is None, "none of them is in reach"
+    assert found.narrow_search(Expectation(), make_index([2, 3]), 150.0).in_reach is None, "none of them is in reach"
 
 
 def test_narrow_search_keeps_all_places_of_a_single_layer(tmp_path):
     expected = Expectation()
-    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow_search(expected, index_of([1, 2]), 300.0) is expected
+    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow_search(expected, make_index([1, 2]), 300.0) is expected

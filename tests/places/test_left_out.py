@@ -20,7 +20,7 @@ from edgevpr.runtime.recognise.judge import AcceptRule, Findings, judge
 RULE = AcceptRule(min_score=0.1, min_margin=0.1, neighbour_m=20.0)
 
 
-class Short(Ruler):
+class SingleStageRuler(Ruler):
     """The same of one stage: a place is ranked by its row alone."""
 
     spec = dataclasses.replace(Ruler.spec, fine=None)
@@ -30,7 +30,7 @@ class Short(Ruler):
 def maps(tmp_path_factory):
     """A map of each technique: the places 0, 10, ... 290, 111 m apart. Their ids are 1 to 30."""
     folder = tmp_path_factory.mktemp("maps")
-    for technique in (Ruler(), Short()):
+    for technique in (Ruler(), SingleStageRuler()):
         with PlaceMap.create(folder / type(technique).__name__, technique.spec) as place_map:
             for number in range(0, 300, 10):
                 position = Position(number * 1e-4, 0.0)
@@ -39,7 +39,7 @@ def maps(tmp_path_factory):
     return folder
 
 
-def opened(technique, maps, tmp_path):
+def open_index(technique, maps, tmp_path):
     """A technique, its map, and the index."""
     path = shutil.copy(maps / type(technique).__name__, tmp_path / "m.gpkg")
     with PlaceMap.open_for_writing(path) as place_map:
@@ -48,12 +48,12 @@ def opened(technique, maps, tmp_path):
 
 @pytest.fixture
 def ruler(maps, tmp_path):
-    yield from opened(Ruler(), maps, tmp_path)
+    yield from open_index(Ruler(), maps, tmp_path)
 
 
 @pytest.fixture
-def short(maps, tmp_path):
-    yield from opened(Short(), maps, tmp_path)
+def single_stage(maps, tmp_path):
+    yield from open_index(SingleStageRuler(), maps, tmp_path)
 
 
 def damage(place_map, change, *numbers):
@@ -162,8 +162,8 @@ def test_retrieve_finds_rivals_among_readable_places(ruler):
     assert margin(ranking, index, 200.0) is not None
 
 
-def test_single_stage_place_left_out_stays_a_rival_but_is_never_returned(short):
-    technique, place_map, index = short
+def test_single_stage_place_left_out_stays_a_rival_but_is_never_returned(single_stage):
+    technique, place_map, index = single_stage
     damage(place_map, f"geom = x'{encode_point(1.0, 1.0).hex()}'", 140)
     ranking = rank(technique, technique.encode(142), place_map, index)
     with pytest.raises(PlaceError, match="position"):

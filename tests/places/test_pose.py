@@ -16,7 +16,7 @@ LANDMARKS = bytes(range(200))
 
 
 @pytest.fixture
-def posed(tmp_path):
+def posed_map(tmp_path):
     """A map of two places: the first has a pose and landmarks."""
     path = tmp_path / "posed.gpkg"
     with PlaceMap.create(path, SPEC) as place_map:
@@ -25,9 +25,9 @@ def posed(tmp_path):
     return path
 
 
-def test_pose_and_landmarks_are_stored_and_optional(posed, tmp_path):
-    assert merge_maps([posed], tmp_path / "copy.gpkg") == ([(2, 0)], False)
-    with PlaceMap.open(posed) as place_map, PlaceMap.open(tmp_path / "copy.gpkg") as copy:
+def test_pose_and_landmarks_are_stored_and_optional(posed_map, tmp_path):
+    assert merge_maps([posed_map], tmp_path / "copy.gpkg") == ([(2, 0)], False)
+    with PlaceMap.open(posed_map) as place_map, PlaceMap.open(tmp_path / "copy.gpkg") as copy:
         for each in (place_map, copy):
             first, second = each.read_places()
             assert first.pose == POSE
@@ -54,29 +54,29 @@ def test_pose_and_landmarks_are_stored_and_optional(posed, tmp_path):
         ("landmarks = zeroblob(20000)", "its landmarks have the wrong size"),
     ],
 )
-def test_pose_that_is_implausible_is_refused(posed, change, says):
-    write_sql(posed, f"UPDATE places SET {change} WHERE place_id = 1")
-    with PlaceMap.open(posed) as place_map:
+def test_pose_that_is_implausible_is_refused(posed_map, change, says):
+    write_sql(posed_map, f"UPDATE places SET {change} WHERE place_id = 1")
+    with PlaceMap.open(posed_map) as place_map:
         (broken,) = [each for each in check_places(place_map) if each.problem]
         assert broken.place_id == 1
         with pytest.raises(PlaceError, match=says):
             [*place_map.read_places([1]), place_map.read_landmarks(1)]
 
 
-def test_repair_map_drops_only_damaged_landmarks_of_a_place(posed):
-    write_sql(posed, "UPDATE places SET landmarks = x'00' WHERE place_id = 1")
-    found = check_map(posed)
+def test_repair_map_drops_only_damaged_landmarks_of_a_place(posed_map):
+    write_sql(posed_map, "UPDATE places SET landmarks = x'00' WHERE place_id = 1")
+    found = check_map(posed_map)
     assert (found.places, found.total, len(found.damaged)) == (2, 2, 1)
-    repair_map(posed)
-    assert check_map(posed).is_intact
-    with PlaceMap.open(posed) as place_map:
+    repair_map(posed_map)
+    assert check_map(posed_map).is_intact
+    with PlaceMap.open(posed_map) as place_map:
         assert [place.place_id for place in place_map.read_places()] == [1, 2]
         assert place_map.read_landmarks(1) is None
 
 
-def test_pose_is_kept_if_another_program_moves_the_place_but_not_its_recorded_position(posed):
-    write_sql(posed, f"UPDATE places SET geom = x'{encode_point(51.0, 9.0).hex()}' WHERE place_id = 1")
-    with PlaceMap.open(posed) as place_map:
+def test_pose_is_kept_if_another_program_moves_the_place_but_not_its_recorded_position(posed_map):
+    write_sql(posed_map, f"UPDATE places SET geom = x'{encode_point(51.0, 9.0).hex()}' WHERE place_id = 1")
+    with PlaceMap.open(posed_map) as place_map:
         (place,) = place_map.read_places([1])
     assert place.pose == dataclasses.replace(POSE, recorded=None)
     assert (place.position.lat_deg, place.position.lon_deg) == (51.0, 9.0)

@@ -41,25 +41,25 @@ def test_open_for_writing_recovers_complete_places_from_a_truncated_log(killed, 
     ends = {end + off for end in range(HEADER + FRAME, len(log), FRAME) for off in (-1, 0, 1)}
     kept = {}
     for cut in sorted({*range(HEADER + 2), *ends, *random.Random(1).sample(range(len(log)), 50), len(log)}):
-        path = copied(killed, tmp_path / str(cut), log[:cut] + bytes(len(log) - cut if rest == "zeros" else 0))
-        kept[cut] = places_of(path)
+        path = copy_map(killed, tmp_path / str(cut), log[:cut] + bytes(len(log) - cut if rest == "zeros" else 0))
+        kept[cut] = count_places(path)
         if cut % 10 == 0:
             with PlaceMap.open_for_writing(path) as place_map:
                 place_map.add(frame(kept[cut]), descriptor(kept[cut]))
-            assert places_of(path) == kept[cut] + 1
+            assert count_places(path) == kept[cut] + 1
     assert list(kept.values()) == sorted(kept.values()), "what is longer holds no less"
     assert kept[len(log)] >= FIRST + PLACES, "all that was confirmed"
     assert kept[0] == FIRST
 
 
-def copied(killed: Path, folder: Path, log: bytes) -> Path:
+def copy_map(killed: Path, folder: Path, log: bytes) -> Path:
     folder.mkdir()
     path = shutil.copy(killed, folder / killed.name)
     path.with_name(f"{path.name}-wal").write_bytes(log)
     return path
 
 
-def places_of(path: Path) -> int:
+def count_places(path: Path) -> int:
     """How many places a map has, each as it was added; the log is merged, and SQLite finds the file whole."""
     with PlaceMap.open(path) as place_map:
         assert place_map.spec == SPEC

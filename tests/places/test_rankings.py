@@ -4,21 +4,21 @@ import dataclasses
 
 import numpy as np
 import pytest
-from ranking import index_of
+from ranking import make_index
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.places.ranking import Ranking, merge_rankings, outside_neighbourhood
 from edgevpr.places.retrieve import choose_best
 
 
-def tried(by_hypothesis, count, among=None):
+def choose_hypotheses(by_hypothesis, count, among=None):
     among = np.ones(len(by_hypothesis), bool) if among is None else among
     return dict(choose_best(by_hypothesis.max(axis=1), by_hypothesis, among, count))
 
 
 def test_choose_hypotheses_takes_the_best_of_many_places():
     by_hypothesis = np.random.default_rng(1).random((500, 24), dtype=np.float32)
-    found = tried(by_hypothesis, 60)
+    found = choose_hypotheses(by_hypothesis, 60)
     assert sum(len(each) for each in found.values()) == 60
     least = min(by_hypothesis[slot, each].min() for slot, each in found.items())
     left = by_hypothesis.copy()
@@ -32,7 +32,7 @@ def test_choose_hypotheses_takes_the_best_of_many_places():
 def test_choose_hypotheses_takes_more_per_place_if_there_are_few_places(places, most):
     by_hypothesis = np.random.default_rng(3).random((places, 24), dtype=np.float32)
     by_hypothesis[0] += 1
-    found = tried(by_hypothesis, 60)
+    found = choose_hypotheses(by_hypothesis, 60)
     assert len(found[0]) == most
     assert sum(len(each) for each in found.values()) == min(60, places * most)
 
@@ -41,19 +41,19 @@ def test_choose_hypotheses_skips_excluded_ones_without_adding_places():
     by_hypothesis = np.random.default_rng(4).random((500, 24), dtype=np.float32)
     by_hypothesis[:, 3:] = -np.inf
     by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
-    found = tried(by_hypothesis, 10)
+    found = choose_hypotheses(by_hypothesis, 10)
     assert sum(len(each) for each in found.values()) == 10
     assert {number for slot, each in found.items() for number in each if slot != 7} == {0, 1, 2}
     by_hypothesis[:] = -np.inf
-    assert not tried(by_hypothesis, 10)
+    assert not choose_hypotheses(by_hypothesis, 10)
 
 
 def test_choose_hypotheses_takes_only_those_of_the_requested_places():
     by_hypothesis = np.random.default_rng(5).random((500, 24), dtype=np.float32)
     among = np.zeros(500, bool)
-    assert not tried(by_hypothesis, 10, among)
+    assert not choose_hypotheses(by_hypothesis, 10, among)
     among[100:103] = True
-    assert sorted(tried(by_hypothesis, 10, among)) == [100, 101, 102]
+    assert sorted(choose_hypotheses(by_hypothesis, 10, among)) == [100, 101, 102]
 
 
 def ranking(compared, rest=(), unread=()):
@@ -88,7 +88,7 @@ def test_promote_moves_a_place_to_the_front():
 
 
 def test_outside_neighbourhood_excludes_two_neighbours_and_the_same_places():
-    index, slots = index_of(range(10, 17)), np.arange(7)
+    index, slots = make_index(range(10, 17)), np.arange(7)
     assert outside_neighbourhood(index, 3, slots, 50.0).tolist() == [True, False, False, False, False, False, True]
     assert outside_neighbourhood(index, 3, slots, 50.0, same_ids=(10,)).tolist() == [False] * 6 + [True]
     assert outside_neighbourhood(index, 3, slots, 50.0, max_slots=3).tolist() == [False] * 7

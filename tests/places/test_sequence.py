@@ -5,17 +5,17 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from ranking import index_of
+from ranking import make_index
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.places.ranking import Ranking
 from edgevpr.places.sequence import SequenceSearch, compute_sequence_bytes
 
-FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)
+ASSUMED_SPEEDS = (0.8, 0.9, 1.0, 1.1, 1.2)
 OTHERS = [quarter / 4 for quarter in range(-10, 13) if quarter != 4]
 
 
-def literal(scores, length, velocities=FOLLOWED):
+def literal(scores, length, velocities=ASSUMED_SPEEDS):
     """Equations 4 to 6 of Milford and Wyeth 2012, each path from its end at the newest query, as mean scores."""
     queries, places = len(scores), len(scores[0])
     found = np.zeros((queries, places))
@@ -32,7 +32,7 @@ def literal(scores, length, velocities=FOLLOWED):
     return found
 
 
-def ranked(scores, slots=None):
+def make_ranking(scores, slots=None):
     """The ranking of one query: all slots, or those that were compared in full."""
     slots = np.arange(len(scores)) if slots is None else np.array(slots)
     slots = slots[np.argsort(-scores[slots], kind="stable")]
@@ -43,14 +43,14 @@ def ranked(scores, slots=None):
     return Ranking(slots=slots, scores=scores[slots].astype(np.float32), compared=matches)
 
 
-def dense(ranking, places):
+def to_dense(ranking, places):
     scores = np.zeros(places, np.float32)
     scores[ranking.slots] = ranking.scores
     return scores
 
 
-def followed(sequence, scores, index, step_s=1.0):
-    return [sequence.add_query(ranked(row), index, at * step_s) for at, row in enumerate(scores)]
+def search_sequence(sequence, scores, index, step_s=1.0):
+    return [sequence.add_query(make_ranking(row), index, at * step_s) for at, row in enumerate(scores)]
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def scores():
 @pytest.mark.parametrize("length", [2, 5, 10, 30])
 def test_sequence_search_equals_the_paper(scores, length):
     sequence = SequenceSearch(length)
-    online = np.stack([dense(each, 40) for each in followed(sequence, scores, index_of(range(40)))])
+    online = np.stack([to_dense(each, 40) for each in search_sequence(sequence, scores, make_index(range(40)))])
     np.testing.assert_allclose(online, literal(scores, length), rtol=1e-5)
     assert sequence.frames == min(length, 25)
     np.testing.assert_allclose(sequence.rivals, literal(scores, length, OTHERS)[-1], rtol=1e-5)
@@ -72,9 +72,9 @@ def test_sequence_search_in_two_stages_equals_the_dense_search(scores):
     compared = np.take_along_axis(scores, candidates, axis=1)
     sparse = np.repeat(np.median(compared, axis=1)[:, None], 40, axis=1)  # the usual score, where none was made
     np.put_along_axis(sparse, candidates, compared, axis=1)
-    sequence, index = SequenceSearch(4), index_of(range(40))
-    rankings = [sequence.add_query(ranked(scores[at], candidates[at]), index, at) for at in range(25)]
-    np.testing.assert_allclose(np.stack([dense(each, 40) for each in rankings]), literal(sparse, 4), rtol=1e-5)
+    sequence, index = SequenceSearch(4), make_index(range(40))
+    rankings = [sequence.add_query(make_ranking(scores[at], candidates[at]), index, at) for at in range(25)]
+    np.testing.assert_allclose(np.stack([to_dense(each, 40) for each in rankings]), literal(sparse, 4), rtol=1e-5)
 
 
 def test_sequence_search_resolves_look_alikes_by_earlier_queries():
@@ -83,15 +83,15 @@ def test_sequence_search_resolves_look_alikes_by_earlier_queries():
     for at in range(6):
         scores[at, 7 + at] = 0.6
     scores[5, 30] = 0.7
-    index = index_of(range(40))
-    best = [each.slots[0] for each in followed(SequenceSearch(5), scores, index)]
+    index = make_index(range(40))
+    best = [each.slots[0] for each in search_sequence(SequenceSearch(5), scores, index)]
     assert best == [7, 8, 9, 10, 11, 12]
 
 
 def test_sequence_matches_keep_the_shift_of_the_newest_query_and_score_the_sequence(scores):
-    sequence, index = SequenceSearch(3), index_of(range(40))
-    sequence.add_query(ranked(scores[0], range(20)), index, 0.0)
-    ranking = sequence.add_query(ranked(scores[1], range(10, 30)), index, 1.0)
+    sequence, index = SequenceSearch(3), make_index(range(40))
+    sequence.add_query(make_ranking(scores[0], range(20)), index, 0.0)
+    ranking = sequence.add_query(make_ranking(scores[1], range(10, 30)), index, 1.0)
     assert (np.diff(ranking.scores) <= 0).all()
     assert set(ranking.slots) == set(range(40))
     assert set(ranking.compared) == set(range(10, 30))
@@ -101,22 +101,22 @@ def test_sequence_matches_keep_the_shift_of_the_newest_query_and_score_the_seque
 
 
 def test_sequence_search_restarts_after_a_time_gap(scores):
-    sequence, index = SequenceSearch(5), index_of(range(40))
-    followed(sequence, scores[:5], index)
+    sequence, index = SequenceSearch(5), make_index(range(40))
+    search_sequence(sequence, scores[:5], index)
     assert sequence.frames == 5
-    fresh = sequence.add_query(ranked(scores[5]), index, 4.0 + 5.1)
+    fresh = sequence.add_query(make_ranking(scores[5]), index, 4.0 + 5.1)
     assert sequence.frames == 1
-    np.testing.assert_array_equal(dense(fresh, 40), scores[5])
-    sequence.add_query(ranked(scores[6]), index, 10.0)
+    np.testing.assert_array_equal(to_dense(fresh, 40), scores[5])
+    sequence.add_query(make_ranking(scores[6]), index, 10.0)
     assert sequence.frames == 2
 
 
 @pytest.mark.slow
 def test_sequence_memory_stays_within_its_declared_size():
     places, length = 50_000, 10
-    index = index_of(range(places))
+    index = make_index(range(places))
     scores = np.random.default_rng(2).random(places, dtype=np.float32)
-    few = ranked(scores, np.argsort(-scores)[:40])
+    few = make_ranking(scores, np.argsort(-scores)[:40])
     sequence = SequenceSearch(length)
     tracemalloc.start()
     for at in range(3 * length):
@@ -136,7 +136,7 @@ def test_sequence_memory_stays_within_its_declared_size():
 )
 def test_sequence_search_requires_the_newest_query_to_show_the_place(queries, least, is_continued):
     sequence, near = SequenceSearch(3), abs(np.arange(80) - 7) <= 2
-    index = index_of(range(80))
+    index = make_index(range(80))
     for query, (slot, score) in enumerate(queries):
         slots, scores = np.array([slot, 40, 50]), np.array([score, 0.1, 0.1], np.float32)
         sequence.add_query(Ranking(slots=slots, scores=scores, compared={}), index, float(query))

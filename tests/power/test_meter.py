@@ -48,7 +48,7 @@ def test_step_does_not_mask_an_exception_before_its_cost_is_set():
     assert meter.steps().encode == NO_COST
 
 
-class Working(FakeClock):
+class WorkingClock(FakeClock):
     """The load of a process, by a clock of its own."""
 
     def __init__(self):
@@ -62,7 +62,7 @@ class Working(FakeClock):
 
 
 def test_own_load_counts_unrecorded_work_too():
-    clocks = Working()
+    clocks = WorkingClock()
     clocks.work(0.5, 0.5)
     clocks.now_s += 1.5
     clocks.cpu_s += 0.3  # another thread decodes a stream
@@ -74,7 +74,7 @@ def test_own_load_counts_unrecorded_work_too():
 
 
 def test_own_load_is_late_only_if_its_thread_had_to_wait():
-    clocks = Working()
+    clocks = WorkingClock()
     clocks.work(0.99, 0.97)
     clocks.now_s += 0.01
     assert clocks.load.measure()[1] == 0.0, "it takes all the time, and nobody else does"

@@ -1,7 +1,7 @@
 """A flight over a map, by the real recogniser, loop and log, for the tests of what is made of it afterwards."""
 
 import pytest
-from browser import driven
+from browser import launch_browser
 from commands import run
 from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
 from flights import Flight
@@ -11,16 +11,16 @@ from edgevpr.core.types import Frame
 from edgevpr.runtime.flight.startup import start_fields
 
 PLACES = 8  # the last pictures are of nothing in the map
-SEEN = 10
+QUERY_COUNT = 10
 STEP_DEG = 0.001  # of latitude: 111 m
 
 
 @pytest.fixture(scope="session")
-def flown(tmp_path_factory):
+def flight_folder(tmp_path_factory):
     """A folder with a flight.jsonl, its map.gpkg, the pictures of the map (`ref`) and of the flight (`seen`), which
     have the same names. The GPS of the aircraft is 90 m beside the map's positions."""
     folder = tmp_path_factory.mktemp("flown")
-    pictures = {f"{number}.png": textured(number, 240, 320) for number in range(SEEN)}
+    pictures = {f"{number}.png": textured(number, 240, 320) for number in range(QUERY_COUNT)}
     write_flight(folder / "ref", list(pictures.values())[:PLACES], STEP_DEG)
     write_flight(folder / "seen", [255 - picture for picture in pictures.values()])
     flags = ["--technique", "cohog", "--param", "w1=208", "--no-calibrate"]
@@ -45,5 +45,5 @@ def flown(tmp_path_factory):
 @pytest.fixture(scope="session")
 def browser():
     """A real browser, started once."""
-    with driven() as started:
+    with launch_browser() as started:
         yield started

@@ -18,10 +18,10 @@ COLUMNS = 4
 STEP_M = 20.0
 
 LOW_REASON = {"code": "LOW_SCORE", "parameters": {"score": 0.004, "min_score": 0.01}}
-UNSURE = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "min_confidence": 0.999, "landmarks": 30}}
+UNCERTAIN = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "min_confidence": 0.999, "landmarks": 30}}
 
 
-def landscape() -> np.ndarray:
+def make_landscape() -> np.ndarray:
     """The ground, BGR, a metre `METRE_PX` pixels, with ORIGIN in its middle and north up."""
     seen = rough_ground(560)
     return np.dstack((seen, 255 - seen, seen // 2))
@@ -32,9 +32,9 @@ def position(east_m: float, north_m: float) -> tuple[float, float]:
     return offset_position(*ORIGIN, east_m, north_m)
 
 
-def places_in(folder: Path) -> list[Place]:
+def write_places(folder: Path) -> list[Place]:
     """Cut a picture for each place of a grid, each turned otherwise, and write it into a folder."""
-    ground, places = landscape(), []
+    ground, places = make_landscape(), []
     for at in range(ROWS * COLUMNS):
         middle_m = np.array([at % COLUMNS - (COLUMNS - 1) / 2, at // COLUMNS - (ROWS - 1) / 2]) * STEP_M
         up_deg = 25.0 * at
@@ -51,7 +51,7 @@ def places_in(folder: Path) -> list[Place]:
     return places
 
 
-def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
+def make_flight_lines(places: list[Place], count: int) -> list[tuple[str, dict]]:
     """The lines of a flight over the places; every third query is refused for its confidence, every fifth for a low
     score."""
     lines = []
@@ -65,7 +65,7 @@ def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
             "position": at,
             "located": None if refused else at,
             "accepted": not refused,
-            "reason": LOW_REASON if is_low else UNSURE,
+            "reason": LOW_REASON if is_low else UNCERTAIN,
             "vehicle": {**at, "t_received_s": t_s, "gps": at | {"lat_deg": at["lat_deg"] + 3e-5, "t_s": t_s}},
             "t_frame_s": t_s,
         }

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from ground import places_in
+from ground import write_places
 from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
@@ -15,7 +15,7 @@ LENS = Lens(60.0)
 
 
 def test_align_picture_returns_the_image_in_the_orientation_of_the_pose(tmp_path):
-    places = places_in(tmp_path)
+    places = write_places(tmp_path)
     tags = {place.source_image: GeoTag(position=place.position, heading_deg=place.pose.up_deg) for place in places}
     write_positions(tmp_path / "positions.csv", tags)
     album, turned = make_album([tmp_path]), places[4]
@@ -39,7 +39,7 @@ def test_make_map_album_cuts_the_pictures_of_an_orthophoto_again(tmp_path):
 
 
 def test_embed_pictures_shrinks_images_and_then_drops_some(tmp_path):
-    keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
+    keys = [[("seen", place.source_image)] for place in write_places(tmp_path)]
     albums = {"seen": make_album([tmp_path])}
     sizes = []
     for room_bytes in (1e6, 3e4, 6e3):

@@ -4,9 +4,9 @@ from dataclasses import replace
 from shutil import copyfile
 
 import pytest
-from browser import data_of, opened
+from browser import data_of, open_page
 from commands import refused
-from ground import STEP_M, places_in, position
+from ground import STEP_M, position, write_places
 
 from edgevpr.cli.main import main
 from edgevpr.core.types import Position
@@ -18,11 +18,11 @@ TWIN = "twin.png"
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def folder(tmp_path_factory):
     """A folder with valley.gpkg and its pictures `ref`; one of them is that of a place 300 m away again."""
     folder = tmp_path_factory.mktemp("mapped")
     (folder / "ref").mkdir()
-    places = places_in(folder / "ref")
+    places = write_places(folder / "ref")
     copyfile(folder / "ref" / places[5].source_image, folder / "ref" / TWIN)
     far = replace(places[5], source_image=TWIN, position=Position(*position(300.0, 0.0)), pose=None)
     tags = {
@@ -41,16 +41,16 @@ def mapped(tmp_path_factory):
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_map_page_shows_places_and_their_problems(browser, mapped):
-    out = mapped / "map.html"
-    argv = ["map", "info", mapped / "valley.gpkg", "--page", out, "--map-images", mapped / "ref"]
+def test_map_page_shows_places_and_their_problems(browser, folder):
+    out = folder / "map.html"
+    argv = ["map", "info", folder / "valley.gpkg", "--page", out, "--map-images", folder / "ref"]
     assert main(list(map(str, argv))) == 0
     data = data_of(out.read_text("utf-8"))
     alike = {step["title"]: step["texts"][-1] for step in data["steps"] if "looks like" in step["texts"][-1]}
     assert "looks like place 13: " in alike["Place 6: 05.png"]
     assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
     assert all("place 13: " in said for title, said in alike.items() if TWIN not in title), "they overlap with its twin"
-    with opened(browser, out) as page:
+    with open_page(browser, out) as page:
         assert page.locator("image").count() == 12
         page.focus("#step")
         for _ in range(5):
@@ -65,10 +65,10 @@ def test_map_page_shows_places_and_their_problems(browser, mapped):
 
 
 @pytest.mark.slow
-def test_map_page_is_never_written_over_the_map(mapped, capsys):
-    before = (mapped / "valley.gpkg").read_bytes()
-    assert "another output" in refused(capsys, "map", "info", mapped / "valley.gpkg", "--page", mapped / "valley.gpkg")
-    assert (mapped / "valley.gpkg").read_bytes() == before
+def test_map_page_is_never_written_over_the_map(folder, capsys):
+    before = (folder / "valley.gpkg").read_bytes()
+    assert "another output" in refused(capsys, "map", "info", folder / "valley.gpkg", "--page", folder / "valley.gpkg")
+    assert (folder / "valley.gpkg").read_bytes() == before
 
 
 def test_find_gaps_finds_ground_missing_between_images(tmp_path):
@@ -78,7 +78,7 @@ def test_find_gaps_finds_ground_missing_between_images(tmp_path):
         )
         for east in range(5)
         for north in range(5)
-        for place in places_in(tmp_path)[:1]
+        for place in write_places(tmp_path)[:1]
     ]
     gaps, covered_m2, gaps_m2 = find_gaps(places)
     assert (gaps, gaps_m2) == ([], 0.0)
@@ -92,7 +92,7 @@ def test_find_gaps_finds_ground_missing_between_images(tmp_path):
 def test_measure_inconsistent_tags_finds_tags_far_from_their_images(tmp_path):
     places = [
         replace(place, pose=replace(place.pose, recorded=Position(*position(0.1 * at, 400.0 if at == 4 else 0.0))))
-        for at, place in enumerate(places_in(tmp_path))
+        for at, place in enumerate(write_places(tmp_path))
     ]
     places = [replace(place, position=Position(*position(0.0, 0.0))) for place in places]
     assert list(measure_inconsistent_tags(places)) == [5]

@@ -13,7 +13,7 @@ from edgevpr.review.album import Album, make_album
 from edgevpr.review.logged import read_flight
 from edgevpr.review.page import make_flight_page
 
-NASTY = "<script>alert(1)</script>\"'><img src=http://example.test/x.png>\x1b\u202e\ud800"
+HTML = "<script>alert(1)</script>\"'><img src=http://example.test/x.png>\x1b\u202e\ud800"
 
 
 def page(path):
@@ -21,15 +21,15 @@ def page(path):
 
 
 @pytest.fixture(scope="module")
-def made(flown, tmp_path_factory):
+def report_page(flight_folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("made") / "report.html"
-    folders = ["--images", flown / "seen", "--map-images", flown / "ref"]
-    assert run("report", flown / "flight.jsonl", "--out", out, *folders) == 0
+    folders = ["--images", flight_folder / "seen", "--map-images", flight_folder / "ref"]
+    assert run("report", flight_folder / "flight.jsonl", "--out", out, *folders) == 0
     return out
 
 
-def test_make_flight_page_of_a_real_flight_has_all_parts(made):
-    data = data_of(made.read_text("utf-8"))
+def test_make_flight_page_of_a_real_flight_has_all_parts(report_page):
+    data = data_of(report_page.read_text("utf-8"))
     assert "longest time without a match" in dict(data["figures"])
     assert {"places", "accepted", "taken", "autopilot", "gps"} <= {each["colour"] for each in data["ground"]["layers"]}
     drawn = [chart["title"] for chart in data["charts"] if any(points for *_, points in chart["series"])]
@@ -38,15 +38,15 @@ def test_make_flight_page_of_a_real_flight_has_all_parts(made):
     assert data["warnings"] == [], "nothing is missing"
 
 
-def test_flight_page_shows_query_and_match_side_by_side_though_their_pictures_have_one_name(made, flown):
-    data = data_of(made.read_text("utf-8"))
+def test_flight_page_shows_query_and_match_side_by_side_though_their_pictures_have_one_name(report_page, flight_folder):
+    data = data_of(report_page.read_text("utf-8"))
     (seen_as, seen), (found_as, found) = (
         (caption, cv2.imdecode(np.frombuffer(base64.b64decode(data["pictures"][at].partition(",")[2]), np.uint8), 0))
         for caption, at in data["steps"][2]["pictures"]
     )
     assert (seen_as, found_as) == ("query: 2.png", "place found: 2.png")
-    assert abs(seen.mean() - cv2.imread(str(flown / "seen" / "2.png"), 0).mean()) < 2
-    assert abs(found.mean() - cv2.imread(str(flown / "ref" / "2.png"), 0).mean()) < 2
+    assert abs(seen.mean() - cv2.imread(str(flight_folder / "seen" / "2.png"), 0).mean()) < 2
+    assert abs(found.mean() - cv2.imread(str(flight_folder / "ref" / "2.png"), 0).mean()) < 2
     assert abs(seen.astype(int) - found).mean() > 20
 
 
@@ -64,9 +64,9 @@ def test_make_album_finds_only_images_in_the_given_folders(tmp_path):
 
 def test_flight_page_treats_names_in_the_log_as_text(tmp_path):
     nasty = query(
-        NASTY, reason={"code": "UNUSABLE", "parameters": {"problem": NASTY}}, reference_image=NASTY, accepted=False
+        HTML, reason={"code": "UNUSABLE", "parameters": {"problem": HTML}}, reference_image=HTML, accepted=False
     )
-    log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": NASTY}))
+    log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": HTML}))
     content = page(log)
     assert content.count("<script") == 2, "the data and the script of the page"
     assert "<img" not in content
@@ -80,13 +80,13 @@ def test_flight_page_keeps_positions_across_the_date_line_together(tmp_path):
     assert data["ground"]["box"][2] == pytest.approx(222.6 + 2 * 30, rel=0.01)
 
 
-def test_report_writes_a_page_without_the_map(flown, tmp_path):
+def test_report_writes_a_page_without_the_map(flight_folder, tmp_path):
     log = write_log(tmp_path / "log", ("start", {"map": str(tmp_path / "gone.gpkg")}), ("query", query("a")))
     assert run("report", log, "--out", tmp_path / "out.html") == 0
     data = data_of((tmp_path / "out.html").read_text("utf-8"))
     assert "not drawn" in data["warnings"][-1]
     assert data["ground"]["layers"]
-    assert run("report", log, "--out", tmp_path / "out.html", "--map", flown / "map.gpkg") == 0
+    assert run("report", log, "--out", tmp_path / "out.html", "--map", flight_folder / "map.gpkg") == 0
     data = data_of((tmp_path / "out.html").read_text("utf-8"))
     assert data["ground"]["layers"][0]["colour"] == "places"
 

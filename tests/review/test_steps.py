@@ -1,8 +1,8 @@
 """The page as its reader moves it, in a real browser: slider, ground, filter."""
 
 import pytest
-from browser import data_of, opened
-from ground import flown_over, places_in
+from browser import data_of, open_page
+from ground import make_flight_lines, write_places
 from logs import query, write_log
 
 from edgevpr.review.album import make_album
@@ -14,31 +14,31 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 COUNT = 30
 
 
-def page_from(log, places=(), folder=None):
+def make_page_from(log, places=(), folder=None):
     album = make_album([folder] if folder else [])
     return make_flight_page(read_flight(log), list(places), album, album)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
+def page_path(tmp_path_factory):
     """A page of a flight over a ground of pictures."""
     folder = tmp_path_factory.mktemp("moved")
     (folder / "ref").mkdir()
-    places = places_in(folder / "ref")
-    log = write_log(folder / "log", *flown_over(places, COUNT))
-    (folder / "page.html").write_text(page_from(log, places, folder / "ref"), "utf-8", "backslashreplace")
+    places = write_places(folder / "ref")
+    log = write_log(folder / "log", *make_flight_lines(places, COUNT))
+    (folder / "page.html").write_text(make_page_from(log, places, folder / "ref"), "utf-8", "backslashreplace")
     return folder / "page.html"
 
 
 @pytest.fixture
-def page(browser, made):
+def page(browser, page_path):
     """The page on a phone, which must ask for nothing and complain of nothing."""
-    with opened(browser, made) as there:
+    with open_page(browser, page_path) as there:
         yield there
 
 
-def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
-    steps = data_of(made.read_text("utf-8"))["steps"]
+def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, page_path):
+    steps = data_of(page_path.read_text("utf-8"))["steps"]
     page.focus("#step")
     seen = set()
     for at in range(3):
@@ -61,7 +61,7 @@ def test_damaged_log_still_has_its_steps(browser, tmp_path):
     """Figures that are none, and no position at all."""
     broken = query("a", confidence="high", evidence=[], position={"lat_deg": 1e99}, located=None, fix=7, vehicle="?")
     log = write_log(tmp_path / "log", ("query", broken), ("query", {"query": None, "place": 1e14}))
-    (tmp_path / "page.html").write_text(page_from(log), "utf-8")
-    with opened(browser, tmp_path / "page.html") as page:
+    (tmp_path / "page.html").write_text(make_page_from(log), "utf-8")
+    with open_page(browser, tmp_path / "page.html") as page:
         assert page.inner_text("#which") == "1 of 2"
         assert page.locator(".view").count() == 0

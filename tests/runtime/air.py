@@ -35,7 +35,7 @@ _NO_COST = QueryCost(
 )  # fmt: skip
 
 
-def match_at(
+def make_match(
     position: Position, t_s: float, vehicle: Vehicle | None, sd_m: float, places, view: View | None = None, lean=None
 ) -> Recognition:
     """An accepted match of a frame taken at `t_s`."""
@@ -53,7 +53,7 @@ def match_at(
     )
 
 
-class Air:
+class SimFlight:
     """A flight in wide circles at `speed_m_s`, with GPS until `lose_gps`. Its autopilot then reckons, wrong by `wind`
     (2,) m/s, which changes by `gusts` m/s a second, and by `velocity_sd` m/s of noise; what is sent it takes. Matches
     of `fix_sd_m` and `other_sd_m`, which say `said_sd_m` of themselves, come every `every_s` and are `late_s` old.
@@ -127,7 +127,7 @@ class Air:
         true_m = self.at_m if t_s is None else self.way[round(t_s / STEP_S)]
         return np.array(offset_m(*HOME, lat_deg, lon_deg)) - true_m
 
-    def fly(self, seconds: float) -> "Air":
+    def fly(self, seconds: float) -> "SimFlight":
         for _ in range(round(seconds / STEP_S)):
             self.step += 1
             before, velocity = self.velocity(self.t_s - STEP_S), self.velocity(self.t_s)
@@ -182,7 +182,7 @@ class Air:
     def match(self, step, vehicle) -> Advice:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
-        event = match_at(where, step * STEP_S, vehicle, self.said_sd_m, self.places(step))
+        event = make_match(where, step * STEP_S, vehicle, self.said_sd_m, self.places(step))
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event = replace(event, frame=frame, odometry=self._stride(step))
         if self.shows_turn:
@@ -234,5 +234,5 @@ class Air:
         self.navigator.handle_vehicle(self.vehicle)
 
 
-def lengths(errors_m) -> np.ndarray:
+def norms(errors_m) -> np.ndarray:
     return np.hypot(*np.array(errors_m).T)

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from air import PICTURE, match_at
+from air import PICTURE, make_match
 from fakes import FakeClock
 from simulated.controller import STEP_S, FlightController
 from simulated.motion import Hover, displacement_m
@@ -151,7 +151,7 @@ class ClosedLoop:
             place = Position(*offset_position(truth.lat_deg, truth.lon_deg, off_m.real, off_m.imag))
             shown = self.show_tilt and self._noise(_SHOWN_SD) - self.brain.tilt
             error = AttitudeError((shown.real, shown.imag), _SHOWN_SD) if self.show_tilt else None
-            event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
+            event = make_match(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
         else:
             frame = Frame(image=PICTURE, name="", t_mono_s=t_s)
             event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(PICTURE, None, _VIEW))

@@ -20,7 +20,7 @@ VECTOR = TechniqueCosts(
 )
 
 
-def found(recall, wrong=0):
+def make_accuracy(recall, wrong=0):
     """What was measured of a technique on two image sets."""
     accepted = {"accepted": 30, "accepted_wrong": wrong, "accepted_elsewhere": wrong}
     return {"recall_at_1": recall, "sets": 2, "queries": 100, "asked": 120, **accepted}

@@ -38,7 +38,7 @@ class Flight:
         self.board = resolve_board(load_board(self.config.board), self.config.source, self.config.memory)
         self.log, self.clock, self.link = log, clock, link
         self.recogniser = open_recogniser(self.config, self.board, uses_hints=True)
-        self.recogniser.meter = metered(self.config, self.recogniser, clock)
+        self.recogniser.meter = make_meter(self.config, self.recogniser, clock)
         self.stop = Stop()
         self.end: dict = {}
 
@@ -90,7 +90,7 @@ def pictures(count: int, first: int = 0) -> list[Image]:
     return [textured(first + number, 240, 320) for number in range(count)]
 
 
-def metered(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:
+def make_meter(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:
     """The meter of queries by the flight's own clock."""
     board = recogniser.meter.board
     return QueryMeter(board, config.battery, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
@@ -101,11 +101,11 @@ def flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) 
     return kind(flight.config.battery, flight.board, flight.clock.clock, **more)
 
 
-def of_kind(lines: list[dict], kind: str) -> list[dict]:
+def select(lines: list[dict], kind: str) -> list[dict]:
     return [line for line in lines if line["kind"] == kind]
 
 
-def nothing() -> None:
+def noop() -> None:
     """Do nothing to a map."""
 
 
@@ -115,4 +115,4 @@ def fly_acts(place_map: Path, log: Path, acts) -> tuple[list[dict], list[dict], 
     flight = Flight(place_map, log, clock, FakeLink(clock), **{"source.rate_hz": 1.0})
     seen = [textured(number % PLACES, 240, 320) for number in range(len(acts))]
     lines = flight.fly(FakeSource(seen, clock, work=lambda: next(calls)()))
-    return of_kind(lines, "query"), lines, flight
+    return select(lines, "query"), lines, flight

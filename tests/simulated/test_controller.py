@@ -29,7 +29,7 @@ IMU = 26
 SECOND = {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}  # the receiver's fix is a plain 3D one, as ours is
 
 
-class Flown:
+class Vehicle:
     """A vehicle 20 s after its start with GPS. Without a `motion` a plane flies straight on, and a copter stays."""
 
     def __init__(self, vehicle: str, motion: Motion | None = None, **parameters: float) -> None:
@@ -42,12 +42,12 @@ class Flown:
         self.brain.motion.begin(0.0)
         self.set(**parameters).wait(20)
 
-    def set(self, **parameters: float) -> "Flown":
+    def set(self, **parameters: float) -> "Vehicle":
         for name, value in parameters.items():
             self.controller.set(name, value)
         return self
 
-    def wait(self, seconds: float, message=None) -> "Flown":
+    def wait(self, seconds: float, message=None) -> "Vehicle":
         """Fly on. Each 0.1 s it receives what `message` makes of it."""
         for _ in range(round(seconds * 10)):
             if message:
@@ -94,13 +94,13 @@ class Flown:
         return self.brain.flags()
 
 
-def lose_gps(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Flown:
+def lose_gps(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Vehicle:
     """Return a vehicle that has just lost GPS, in a wind that it does not know."""
-    return Flown(vehicle, **parameters).set(SIM_GPS1_ENABLE=0, SIM_WIND_SPD=wind_m_s)
+    return Vehicle(vehicle, **parameters).set(SIM_GPS1_ENABLE=0, SIM_WIND_SPD=wind_m_s)
 
 
 def gps_input(north_m: float = 1.0, accuracy_m: float = 1.0, fix_type: int = 3, satellites: int = 6):
-    def make(flown: Flown):
+    def make(flown: Vehicle):
         message = messages.make_gps_input(flown.state(north_m, accuracy_m), 1, 0.0, None)
         message.fix_type, message.satellites_visible = fix_type, satellites
         return message
@@ -108,8 +108,8 @@ def gps_input(north_m: float = 1.0, accuracy_m: float = 1.0, fix_type: int = 3, 
     return make
 
 
-def sensed(north_m: float = 0.0, eph_m: float = 1.0, slot: int = 1):
-    def make(flown: Flown):
+def make_sensor_position(north_m: float = 0.0, eph_m: float = 1.0, slot: int = 1):
+    def make(flown: Vehicle):
         message = messages.make_position_sensor(flown.state(north_m, eph_m))
         message.id = slot
         return message
@@ -124,7 +124,7 @@ def odometry(frame: int = mavlink.MAV_FRAME_LOCAL_FRD, quality: int = 50):
 
 
 def test_fix_fails_with_gps_and_for_a_second_after_its_loss_and_is_denied_in_a_wrong_form():
-    flown = Flown("arduplane")
+    flown = Vehicle("arduplane")
     assert flown.fix() == FAILED
     assert flown.fix(frame=5) == FAILED, "the form is right, the time is not"
     assert [flown.fix(frame=3), flown.fix(frame=6), flown.fix(z=100.0)] == [DENIED] * 3
@@ -135,7 +135,7 @@ def test_fix_fails_with_gps_and_for_a_second_after_its_loss_and_is_denied_in_a_w
 
 
 def test_plane_drifts_in_an_unknown_wind_until_a_fix_or_gps():
-    known = Flown("arduplane", SIM_WIND_SPD=6).wait(20).set(SIM_GPS1_ENABLE=0)
+    known = Vehicle("arduplane", SIM_WIND_SPD=6).wait(20).set(SIM_GPS1_ENABLE=0)
     assert known.wait(60).error_m < 10
     flown = lose_gps("arduplane").wait(150)
     assert flown.error_m == pytest.approx(767, rel=0.05), "as a real one"
@@ -152,7 +152,7 @@ def test_plane_drifts_in_an_unknown_wind_until_a_fix_or_gps():
 
 
 def test_second_receiver_takes_over_but_a_jump_is_not_followed_at_once():
-    flown = Flown("arducopter", **SECOND).wait(5, gps_input()).set(SIM_GPS1_ENABLE=0).wait(25, gps_input())
+    flown = Vehicle("arducopter", **SECOND).wait(5, gps_input()).set(SIM_GPS1_ENABLE=0).wait(25, gps_input())
     assert flown.error_m == pytest.approx(1, abs=0.2)
     assert flown.flags & mavlink.EKF_POS_HORIZ_ABS
     assert flown.wait(4, gps_input(north_m=25.0)).error_m < 8
@@ -182,7 +182,7 @@ def test_copter_without_gps_loses_its_position_despite_a_fix():
     ],
 )
 def test_primary_receiver_has_more_satellites(switch, satellites, seconds, is_ours):
-    flown = Flown("arducopter", GPS_AUTO_SWITCH=switch, **SECOND)
+    flown = Vehicle("arducopter", GPS_AUTO_SWITCH=switch, **SECOND)
     receivers = flown.brain.receivers
     receivers._switched_s = flown.now_s
     flown.set(SIM_GPS1_NUMSATS=satellites).wait(seconds + 1.5, gps_input())
@@ -201,12 +201,12 @@ def test_primary_receiver_has_more_satellites(switch, satellites, seconds, is_ou
     ],
 )
 def test_receivers_are_chosen_or_blended_by_their_accuracies(told, parameters, error_m):
-    flown = Flown("arducopter", **SECOND, **parameters).wait(20, gps_input(**told))
+    flown = Vehicle("arducopter", **SECOND, **parameters).wait(20, gps_input(**told))
     assert flown.error_m == pytest.approx(error_m, abs=0.1)
 
 
 def test_copter_uses_odometry_of_the_correct_frame_and_quality():
-    flown = Flown("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6, VISO_QUAL_MIN=10)
+    flown = Vehicle("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6, VISO_QUAL_MIN=10)
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
     for message in (odometry(frame=mavlink.MAV_FRAME_LOCAL_NED), odometry(quality=5)):
@@ -214,12 +214,12 @@ def test_copter_uses_odometry_of_the_correct_frame_and_quality():
     assert flown.wait(10, odometry()).flags & mavlink.EKF_POS_HORIZ_ABS
 
 
-USES_OURS = {"GPS2_TYPE": 14, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}
+OUR_RECEIVER_PRIMARY = {"GPS2_TYPE": 14, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}
 
 
 def test_vehicle_that_follows_its_estimate_is_misled_by_wrong_positions():
     motion = Hover(ORIGIN, 60.0)
-    flown = Flown("arducopter", motion, **USES_OURS)
+    flown = Vehicle("arducopter", motion, **OUR_RECEIVER_PRIMARY)
     assert motion.away_m < 0.5
     flown.wait(60, gps_input(north_m=10.0))
     assert (motion.away_m, flown.error_m) == pytest.approx((10.0, 10.0), abs=0.5)
@@ -233,14 +233,14 @@ def test_vehicle_that_receives_its_own_estimate_diverges_with_a_tilt():
         return message
 
     motion = Hover(ORIGIN, 60.0)
-    flown = Flown("arducopter", motion, **USES_OURS).wait(75, make_own)
+    flown = Vehicle("arducopter", motion, **OUR_RECEIVER_PRIMARY).wait(75, make_own)
     assert 100 < motion.away_m < 500
     assert flown.error_m == pytest.approx(motion.away_m, rel=0.1)
     assert 0.3 < math.degrees(abs(flown.brain.tilt)) < 5
 
 
 def test_px4_accepts_a_fix_at_any_time_and_has_no_frame():
-    flown = Flown("px4-plane")
+    flown = Vehicle("px4-plane")
     assert flown.fix() == ACCEPTED, "with GPS too"
     assert flown.set(SIM_GPS1_ENABLE=0, SIM_WIND_SPD=6).wait(60).error_m > 200
     assert flown.fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=math.nan, param3=math.nan) == ACCEPTED
@@ -251,17 +251,17 @@ def test_px4_accepts_a_fix_at_any_time_and_has_no_frame():
 
 
 def test_px4_fuses_message_296_of_its_slot_and_flags_it():
-    flown = Flown("px4-copter", EKF2_GPS_CTRL=0).wait(8)
+    flown = Vehicle("px4-copter", EKF2_GPS_CTRL=0).wait(8)
     assert flown.brain.receivers.primary.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
     assert not flown.flags & (FUSES | FUSES_ANY), "the flags alone show a receiver that is not used"
-    assert flown.wait(6, sensed(2.0)).flags & (FUSES | FUSES_ANY) == FUSES | FUSES_ANY
+    assert flown.wait(6, make_sensor_position(2.0)).flags & (FUSES | FUSES_ANY) == FUSES | FUSES_ANY
     assert flown.error_m == pytest.approx(2, abs=0.5)
-    for ignored in (sensed(2.0, eph_m=0.0), sensed(2.0, slot=2)):
+    for ignored in (make_sensor_position(2.0, eph_m=0.0), make_sensor_position(2.0, slot=2)):
         assert not flown.wait(7, ignored).flags & (mavlink.ESTIMATOR_POS_HORIZ_ABS | FUSES)
 
 
 def test_px4_fuses_odometry_by_another_flag():
-    flown = Flown("px4-copter", EKF2_EV_CTRL=1).set(EKF2_GPS_CTRL=0).wait(8)
+    flown = Vehicle("px4-copter", EKF2_EV_CTRL=1).set(EKF2_GPS_CTRL=0).wait(8)
     flown.wait(6, lambda flown: messages.make_vision_position(flown.state(2.0), flown.brain.origin))
     assert flown.flags & (FUSES | FUSES_ANY) == FUSES_ANY
     assert flown.error_m == pytest.approx(2, abs=0.5)
@@ -269,9 +269,9 @@ def test_px4_fuses_odometry_by_another_flag():
 
 
 def test_px4_refuses_contradicting_gps_until_our_positions_stop():
-    flown = lose_gps("px4-copter", wind_m_s=0).wait(10).wait(10, sensed(100.0))
+    flown = lose_gps("px4-copter", wind_m_s=0).wait(10).wait(10, make_sensor_position(100.0))
     assert flown.error_m == pytest.approx(100, abs=10)
-    flown.set(SIM_GPS1_ENABLE=1).wait(40, sensed(100.0))
+    flown.set(SIM_GPS1_ENABLE=1).wait(40, make_sensor_position(100.0))
     assert flown.error_m == pytest.approx(100, abs=10)
     assert flown.flags & mavlink.ESTIMATOR_GPS_GLITCH
     assert flown.wait(4).error_m > 50, "it waits five seconds for ours"
@@ -280,13 +280,13 @@ def test_px4_refuses_contradicting_gps_until_our_positions_stop():
 
 
 def test_px4_with_good_gps_fuses_only_our_positions_within_the_gate():
-    flown = Flown("px4-copter").wait(20, sensed(100.0))
+    flown = Vehicle("px4-copter").wait(20, make_sensor_position(100.0))
     assert flown.error_m < 0.1
-    assert 0.05 < flown.wait(20, sensed(2.0)).error_m < 1
+    assert 0.05 < flown.wait(20, make_sensor_position(2.0)).error_m < 1
 
 
 def test_px4_stops_fusing_a_spoofed_receiver_after_seven_seconds():
-    flown = Flown("px4-copter").set(SIM_GPS_SPOOF=1)
+    flown = Vehicle("px4-copter").set(SIM_GPS_SPOOF=1)
     assert flown.wait(6).flags & FUSES
     assert not flown.wait(3).flags & FUSES
     assert flown.set(SIM_GPS_SPOOF=0).wait(2).flags & FUSES

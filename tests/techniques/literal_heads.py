@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 
-def normalised(vectors):
+def normalise_rows(vectors):
     """Each row at length 1."""
     return vectors / np.sqrt((vectors**2).sum(axis=-1, keepdims=True))
 
@@ -23,7 +23,7 @@ def pyramid(features, levels):
     )
 
 
-def projected(vector, row, signs, length):
+def project_vector(vector, row, signs, length):
     """The whole matrix, value by value: row j is the Gaussian vector moved on by j, each column with its sign."""
     size = len(vector)
     matrix = np.array([[row[(i - j) % size] * signs[i] for i in range(size)] for j in range(length)])
@@ -57,7 +57,7 @@ def rmac_vectors(features, regions):
     largest = np.array(
         [features[:, top : top + side, left : left + side].max(axis=(1, 2)) for top, left, side in regions], float
     )
-    return normalised(np.sign(largest) * np.sqrt(abs(largest)))
+    return normalise_rows(np.sign(largest) * np.sqrt(abs(largest)))
 
 
 def vlad(local, words, soft_sharpness=None):
@@ -76,7 +76,7 @@ def vlad(local, words, soft_sharpness=None):
 
 def intra_normalised(sums):
     """Each word's sum at length 1, and then all of them together."""
-    return normalised(np.concatenate([normalised(row) if any(row) else row for row in sums]))
+    return normalise_rows(np.concatenate([normalise_rows(row) if any(row) else row for row in sums]))
 
 
 def regions(features, count):
@@ -97,11 +97,11 @@ def regions(features, count):
     return sorted(found, key=lambda region: -region[2])[:count]
 
 
-def under_box(features, inside):
+def sum_box(features, inside):
     """The sum of each channel in the box around a region."""
     ys, xs = [y for y, _ in inside], [x for _, x in inside]
     box = features[:, min(ys) : max(ys) + 1, min(xs) : max(xs) + 1]
-    return normalised(box.astype(float).sum(axis=(1, 2)))
+    return normalise_rows(box.astype(float).sum(axis=(1, 2)))
 
 
 def mutual_score(query, place):
@@ -117,4 +117,4 @@ def bag_of_words(local, words):
     present = np.zeros(len(words))
     for x in local.astype(float):
         present[((x - words) ** 2).sum(axis=1).argmin()] = 1
-    return normalised(present)
+    return normalise_rows(present)

@@ -34,13 +34,13 @@ def whole_numbers():
     return ((x * x // 97 + y * y // 61 + x * y // 173 + (x // 9 * 37 ^ y // 7 * 29)) % 256).astype(np.uint8)
 
 
-def dim_picture():
+def make_dim_picture():
     """A picture with few grey levels, which is stretched."""
     y, x = np.mgrid[:480, :640]
     return (60 + whole_numbers() // 24 + (x // 40 + y // 30 * 3) % 17).astype(np.uint8)
 
 
-PICTURES = {"ordinary": whole_numbers, "dim": dim_picture}
+PICTURES = {"ordinary": whole_numbers, "dim": make_dim_picture}
 CHECKSUMS = {
     "forward, ordinary": "3849885506 598602243 4103587366 2563522183",
     "nadir, ordinary": "959436069 1475824441 556021769 4160277071",
@@ -68,14 +68,14 @@ def compute_checksums(**environment):
 def print_checksums():
     for camera, kind in itertools.product(("forward", "nadir"), PICTURES):
         descriptor = create("cohog", {"camera": camera}).encode(PICTURES[kind]())
-        report(f"{camera}, {kind}", descriptor.coarse, descriptor.fine, descriptor.regions, descriptor.good)
+        print_crc(f"{camera}, {kind}", descriptor.coarse, descriptor.fine, descriptor.regions, descriptor.good)
     picture, forward = whole_numbers(), create("cohog")
-    report("packed", forward.pack(forward.encode(picture).coarse[None], np.full((12, 12, 8), 90.0, np.float32)))
+    print_crc("packed", forward.pack(forward.encode(picture).coarse[None], np.full((12, 12, 8), 90.0, np.float32)))
     rule = {"layout": "NCHW", "height": 512, "width": 512, "colour": "grey", "equalise": False, "resize": "linear"}
-    report("seen by a network", prepare_input(picture, InputRule(**rule, scale=1.0, mean=[0.0])).astype(np.uint8))
+    print_crc("seen by a network", prepare_input(picture, InputRule(**rule, scale=1.0, mean=[0.0])).astype(np.uint8))
 
 
-def report(what, *parts):
+def print_crc(what, *parts):
     print(f"{what}:", *map(zlib.crc32, parts))
 
 

@@ -141,13 +141,13 @@ def test_covariance_comes_from_the_residuals_of_pairs():
     assert mixed.covariance_cells2[0] > 1 / 12
 
 
-def is_as_it_was(match):
+def is_unaligned(match):
     return match.covariance_cells2 is None and (match.rotation_deg, match.height_ratio) == (350.0, 2.0)
 
 
 def test_align_refuses_too_few_pairs_and_those_of_different_places():
     asking, best = make_pairs((0.0, 0.0), 0.0, 1.0)
-    assert is_as_it_was(align((asking[0][:7], SIDE), (best[0][:7], SIDE), (0.0, 0.0)))
-    assert is_as_it_was(align(asking, best, (40.0, 40.0)))
+    assert is_unaligned(align((asking[0][:7], SIDE), (best[0][:7], SIDE), (0.0, 0.0)))
+    assert is_unaligned(align(asking, best, (40.0, 40.0)))
     same = np.zeros(20, int)
-    assert is_as_it_was(align((same, SIDE), (same, SIDE), (0.0, 0.0))), "one point has no rotation"
+    assert is_unaligned(align((same, SIDE), (same, SIDE), (0.0, 0.0))), "one point has no rotation"

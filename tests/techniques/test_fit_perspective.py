@@ -9,7 +9,7 @@ CELLS = 32.0
 GRID = np.add.outer(1j * np.arange(-15.0, 16.0), np.arange(-15.0, 16.0)).ravel()
 
 
-def lay(points, slope, turn_scale, shift):
+def make_perspective_pairs(points, slope, turn_scale, shift):
     """The pairs that regions of a query with this slope, of the longest side, lie over, to whole cells."""
     scale = 1 - (slope[0] * points.real + slope[1] * points.imag) / CELLS
     there = turn_scale * points / scale + shift
@@ -19,7 +19,7 @@ def lay(points, slope, turn_scale, shift):
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, 0.0), (-0.2, 0.4)])
 def test_fit_perspective_finds_the_slope_among_wrong_pairs(slope):
     turn_scale, shift, rng = 1.05 * np.exp(0.1j), 2 - 3j, np.random.default_rng(1)
-    known = lay(GRID, slope, turn_scale, shift)
+    known = make_perspective_pairs(GRID, slope, turn_scale, shift)
     wrong = rng.random(len(GRID)) < 0.5
     known[wrong] = rng.permutation(GRID)[wrong]
     homography, sd, regions = fit_perspective(GRID, known, turn_scale, shift)

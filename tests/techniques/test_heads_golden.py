@@ -36,7 +36,7 @@ def test_projection_equals_the_product_with_its_matrix(size, length):
     vector = np.random.default_rng(3).normal(size=size).astype(np.float32)
     row, signs = network.make_gaussian_row(size, seed=5)
     project = network.make_gaussian_projection(size, length, seed=5)
-    expected = literal.projected(vector, row, signs, length)
+    expected = literal.project_vector(vector, row, signs, length)
     np.testing.assert_allclose(project(vector), expected, rtol=1e-4, atol=1e-5)
 
 
@@ -60,7 +60,7 @@ def test_rmac_vectors_and_aggregate():
     where = regions.make_square_regions(7, 9)
     vectors = regions.pool_squares(SIGNED, where)
     np.testing.assert_allclose(vectors, literal.rmac_vectors(SIGNED, where), rtol=1e-5, atol=1e-6)
-    expected = literal.normalised(literal.rmac_vectors(SIGNED, where).sum(axis=0))
+    expected = literal.normalise_rows(literal.rmac_vectors(SIGNED, where).sum(axis=0))
     np.testing.assert_allclose(words.normalise_rows(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
 
 
@@ -98,7 +98,7 @@ def test_regions_are_the_most_energetic_connected_activations(dead, count):
     for box, vector, (_, pixels, _) in zip(boxes, described, expected, strict=True):
         ys, xs = zip(*pixels, strict=True)
         assert box.tolist() == [min(ys), min(xs), max(ys) + 1, max(xs) + 1]
-        np.testing.assert_allclose(vector, literal.under_box(features, pixels), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(vector, literal.sum_box(features, pixels), rtol=1e-4, atol=1e-5)
 
 
 def test_equal_regions_are_sorted_by_channel_and_position():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import seen_from_above, textured
+from pictures import textured, view_from_above
 
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
@@ -16,7 +16,7 @@ NOTHING = 0x88
 
 def view(seed, rotation_deg=0.0, right_px=0, down_px=0):
     """The ground of a place."""
-    return seen_from_above(textured(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, rotation_deg, right_px, down_px)
+    return view_from_above(textured(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, rotation_deg, right_px, down_px)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_score_places_matches_nothing_without_a_good_region(town):
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * 3
 
 
-def possible(by_hypothesis):
+def list_possible_rotations(by_hypothesis):
     """Degrees of the rotations that are not out of the question, place by place."""
     return [sorted({15 * int(at) % 360 for at in np.flatnonzero(np.isfinite(scores))}) for scores in by_hypothesis]
 
@@ -110,10 +110,10 @@ def test_score_places_allows_only_rotations_near_the_expected_one(town):
     query, rows = technique.encode(view(0)), np.resize(rows, (8, PLACE_BYTES))
     rotation_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
     scores, by_rotation = technique.score_places(query, rows, None, rotation_deg)
-    sets = possible(by_rotation)
+    sets = list_possible_rotations(by_rotation)
     assert sets[:3] == [[0, 15, 345], [0, 15, 345], [0, 15, 30]]
     assert sets[3:7] == [[90, 105, 120], [0, 330, 345], [0, 15, 345], [0, 15, 345]]
     everything, by_rotation = technique.score_places(query, rows, None)
-    assert sets[7] == possible(by_rotation)[7] == list(range(0, 360, 15))
+    assert sets[7] == list_possible_rotations(by_rotation)[7] == list(range(0, 360, 15))
     assert (scores <= everything + 1e-6).all()
     np.testing.assert_allclose(scores[[0, 7]], everything[[0, 7]], atol=1e-6)

@@ -103,7 +103,7 @@ def test_open_backbone_refuses_an_invalid_number_of_threads(models, threads):
         open_backbone("tiny", "features", threads)
 
 
-BROKEN = """
+FAULTY_CARDS = """
 import sys
 sys.modules["onnxruntime"] = None  # what an import of a broken one does
 from edgevpr import techniques
@@ -119,7 +119,7 @@ except techniques.EdgevprError as error:
 @pytest.mark.process
 def test_techniques_without_networks_need_no_onnxruntime(models):
     write_network(models)
-    done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", FAULTY_CARDS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("onnxruntime cannot be imported (")
     assert done.stdout.endswith("hog, cohog and seqslam work without it.\n")

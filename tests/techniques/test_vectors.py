@@ -11,7 +11,7 @@ from edgevpr.techniques.vectors import FORMS, VectorTechnique
 LENGTH = 131  # no multiple of anything
 
 
-class Given(VectorTechnique):
+class Vectors(VectorTechnique):
     """Encodes the vector that the test hands it as the image."""
 
     def __init__(self, form="float", similarity="cosine", length=LENGTH):
@@ -21,15 +21,15 @@ class Given(VectorTechnique):
         return image
 
 
-def places(count=40, seed=0, length=LENGTH):
+def make_vectors(count=40, seed=0, length=LENGTH):
     """Vectors with a large common part, as those of networks have."""
     rng = np.random.default_rng(seed)
     return (1.0 + rng.normal(0, 0.3, (count, length))).astype(np.float32)
 
 
-def made(form, similarity, vectors):
+def make_rows(form, similarity, vectors):
     """Technique, coarse parts, their mean, and the rows of the index."""
-    technique = Given(form, similarity, vectors.shape[1])
+    technique = Vectors(form, similarity, vectors.shape[1])
     coarse = np.stack([technique.encode(vector).coarse for vector in vectors])
     mean = coarse.astype(np.float32).mean(axis=0)
     rows = technique.pack(coarse, mean) if technique.spec.packed else coarse
@@ -56,8 +56,8 @@ def literal_score(form, similarity, query, place, mean):
 @pytest.mark.parametrize("similarity", ["cosine", "l1"])
 @pytest.mark.parametrize("form", FORMS)
 def test_scores_are_those_of_a_literal_loop(form, similarity):
-    technique, coarse, mean, rows = made(form, similarity, places())
-    query = technique.encode(places(1, seed=5)[0])
+    technique, coarse, mean, rows = make_rows(form, similarity, make_vectors())
+    query = technique.encode(make_vectors(1, seed=5)[0])
     scores, hypotheses = technique.score_places(query, rows, mean)
     assert hypotheses is None
     assert scores.dtype == np.float32
@@ -67,35 +67,35 @@ def test_scores_are_those_of_a_literal_loop(form, similarity):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_score_places_is_finite_for_one_place_or_identical_places(form):
-    technique, coarse, mean, rows = made(form, "cosine", np.repeat(places(1), 3, axis=0))
-    for query in (coarse[0], places(1, seed=3)[0], np.zeros(LENGTH)):
+    technique, coarse, mean, rows = make_rows(form, "cosine", np.repeat(make_vectors(1), 3, axis=0))
+    for query in (coarse[0], make_vectors(1, seed=3)[0], np.zeros(LENGTH)):
         scores, _ = technique.score_places(technique.encode(query.astype(np.float32)), rows, mean)
         assert np.isfinite(scores).all()
         assert ((scores >= 0) & (scores <= 1)).all()
 
 
 def test_form_has_its_own_default_margin():
-    assert [Given(form).min_margin for form in FORMS] == [0.1, 0.2, 0.3]
+    assert [Vectors(form).min_margin for form in FORMS] == [0.1, 0.2, 0.3]
     with pytest.raises(UsageError, match="2bit"):
-        Given("2bit")
+        Vectors("2bit")
 
 
 def test_encode_refuses_values_beyond_half_precision():
     with pytest.raises(ModelError, match="half-precision range"):
-        Given(similarity="l1").encode(np.full(LENGTH, 1e6, np.float32))
-    assert Given().encode(np.full(LENGTH, 1e6, np.float32)).quality == 1
+        Vectors(similarity="l1").encode(np.full(LENGTH, 1e6, np.float32))
+    assert Vectors().encode(np.full(LENGTH, 1e6, np.float32)).quality == 1
 
 
 def test_encode_gives_quality_zero_for_a_zero_vector():
-    assert Given().encode(np.zeros(LENGTH, np.float32)).quality == 0
-    assert Given(similarity="l1").encode(np.full(LENGTH, 1e-9, np.float32)).quality == 0  # zeros in half precision
-    assert Given().encode(places(1)[0]).quality == 1
+    assert Vectors().encode(np.zeros(LENGTH, np.float32)).quality == 0
+    assert Vectors(similarity="l1").encode(np.full(LENGTH, 1e-9, np.float32)).quality == 0  # zeros in half precision
+    assert Vectors().encode(make_vectors(1)[0]).quality == 1
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_score_places_is_zero_for_a_blank_image_even_against_another(form):
-    technique, nothing = Given(form), Given().encode(np.zeros(LENGTH, np.float32))
-    coarse = np.stack([nothing.coarse, *(technique.encode(place).coarse for place in places(5))])
+    technique, nothing = Vectors(form), Vectors().encode(np.zeros(LENGTH, np.float32))
+    coarse = np.stack([nothing.coarse, *(technique.encode(place).coarse for place in make_vectors(5))])
     mean = coarse.astype(np.float32).mean(axis=0)
     rows = coarse if form == "float" else technique.pack(coarse, mean)
     assert not technique.score_places(nothing, rows, mean)[0].any()
@@ -104,9 +104,9 @@ def test_score_places_is_zero_for_a_blank_image_even_against_another(form):
 @pytest.mark.parametrize("similarity", ["cosine", "l1"])
 @pytest.mark.parametrize("form", FORMS)
 def test_score_places_needs_little_memory_besides_the_rows(form, similarity):
-    technique, _, mean, rows = made(form, similarity, places(16, length=4096))
+    technique, _, mean, rows = make_rows(form, similarity, make_vectors(16, length=4096))
     many = np.resize(rows, (8192, rows.shape[1]))  # as float32 all of them would be 134 MB
-    query = technique.encode(places(1, length=4096)[0])
+    query = technique.encode(make_vectors(1, length=4096)[0])
     tracemalloc.start()
     scores, _ = technique.score_places(query, many, mean)
     peak = tracemalloc.get_traced_memory()[1]

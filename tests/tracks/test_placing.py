@@ -20,7 +20,7 @@ GROUND_PX = 2400
 HOME = (50.0, 8.0)
 
 
-def taken(path, t_s, picture=None, clock_off_s=0.0):
+def write_photograph(path, t_s, picture=None, clock_off_s=0.0):
     """Write a JPEG whose camera shows the time `t_s` of the flight, in seconds from its start."""
     exif = Image.Exif()
     shown = datetime.fromtimestamp(START_S + t_s - clock_off_s, timezone.utc)
@@ -32,7 +32,7 @@ def taken(path, t_s, picture=None, clock_off_s=0.0):
 def folder(tmp_path):
     (tmp_path / "flight").mkdir()
     for number in range(6):
-        taken(tmp_path / "flight" / f"IMG_{number}.JPG", 2 * number + 1)
+        write_photograph(tmp_path / "flight" / f"IMG_{number}.JPG", 2 * number + 1)
     return tmp_path / "flight"
 
 
@@ -73,7 +73,7 @@ def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours):
     folder = tmp_path / "flight"
     folder.mkdir()
     for number in range(6):
-        taken(folder / f"{number}.jpg", 60 * number + 1, clock_off_s=3600 * hours)
+        write_photograph(folder / f"{number}.jpg", 60 * number + 1, clock_off_s=3600 * hours)
     write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(0, 400, 2)])
     found = run_json(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     assert (found["placed"], found["offset_s"]) == (6, 3600 * hours)
@@ -94,7 +94,7 @@ def test_positions_refuses_pictures_of_another_day_with_both_times(capsys, folde
     assert not (folder / "positions.csv").exists()
 
 
-def flown(count=40):
+def fly_curves(count=40):
     """Return a track at 5 Hz, (seconds, lat, lon), of an aircraft that flies curves, and pictures of the ground that it
     takes every two seconds, its camera turned by 30 degrees against its nose."""
     ground = textured(5, GROUND_PX, GROUND_PX)
@@ -118,11 +118,11 @@ def flown(count=40):
 
 @pytest.mark.slow
 def test_estimate_clock_offset_s_sets_the_clock_by_the_motion_of_the_pictures(capsys, tmp_path):
-    track, pictures = flown()
+    track, pictures = fly_curves()
     folder = tmp_path / "flight"
     folder.mkdir()
     for number, picture in enumerate(pictures):
-        taken(folder / f"{number}.jpg", 2 * number, picture, clock_off_s=3600 - 17)
+        write_photograph(folder / f"{number}.jpg", 2 * number, picture, clock_off_s=3600 - 17)
     write_gpx(tmp_path / "t.gpx", track)
     found = run_json(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     assert found["offset_s"] == pytest.approx(3583, abs=0.8)

@@ -13,7 +13,7 @@ POINTS = [(t, -35.36 + 1e-4 * t, 149.16 + 2e-4 * t, 600.0 + t, 20.0 + t, 5.0, -3
 SHOTS = [(t + 0.5, -35.5 + 1e-4 * t, 149.5, 610.0, 30.0, 1.0, 2.0, 90.0) for t in range(3)]
 
 
-def agrees(tag, point, of_height=True):
+def require_tag(tag, point, of_height=True):
     _, lat, lon, alt, height, roll, pitch, yaw = point
     assert (tag.position.lat_deg, tag.position.lon_deg) == pytest.approx((lat, lon), abs=1e-6)
     assert tag.position.alt_m == pytest.approx(alt, abs=0.1)
@@ -29,9 +29,9 @@ def test_read_record_reads_track_and_camera_messages_of_a_log(tmp_path, ending, 
     assert record.is_utc
     assert record.track.t_s == pytest.approx([START_S + t for t in range(6)], abs=0.01)
     for tag, point in zip(record.track.tags, POINTS, strict=True):
-        agrees(tag, point)
+        require_tag(tag, point)
     for tag, shot in zip(record.shots, SHOTS, strict=True):
-        agrees(tag, shot)
+        require_tag(tag, shot)
 
 
 @pytest.mark.parametrize(("ending", "write"), [(".bin", write_dataflash), (".tlog", write_tlog)])
@@ -43,7 +43,7 @@ def test_read_record_reads_a_truncated_log_without_output(tmp_path, capfd, endin
     assert capfd.readouterr() == ("", "")
 
 
-def px4(position="vehicle_global_position"):
+def px4_log(position="vehicle_global_position"):
     stamps = [int(1e6 * (7 + t)) for t in range(6)]
     north = (1.0, 0.0, 0.0, 0.0)
     where = {"timestamp": "uint64_t", "lat": "double", "lon": "double", "alt": "float"}
@@ -61,7 +61,7 @@ def px4(position="vehicle_global_position"):
 
 
 def test_read_record_reads_the_time_of_a_px4_log_from_its_receiver(tmp_path):
-    write_ulog(tmp_path / "flight.ulg", px4() | {"camera_capture": px4("camera_capture")["camera_capture"]})
+    write_ulog(tmp_path / "flight.ulg", px4_log() | {"camera_capture": px4_log("camera_capture")["camera_capture"]})
     record = read_record(tmp_path / "flight.ulg")
     assert record.track.t_s == pytest.approx([START_S + t for t in range(6)], abs=0.01)
     assert len(record.shots) == 6

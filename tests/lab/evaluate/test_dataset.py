@@ -34,14 +34,14 @@ def test_load_dataset_reads_right_and_ignored_references_of_scored_queries(folde
     )
     assert dataset.references == ("a.png", "b.png", "c.png")
     assert dataset.queries[0].path == folder / "query" / "b.png"
-    assert right_of(dataset) == {"b.png": ({"a.png", "b.png"}, {"c.png"}), "a.png": ({"c.png"}, set())}
+    assert list_correct(dataset) == {"b.png": ({"a.png", "b.png"}, {"c.png"}), "a.png": ({"c.png"}, set())}
     assert dataset.unscored == 1
 
 
 @pytest.mark.parametrize("row", ["b.png,,,ok", "b.png,,,novel"])
 def test_load_dataset_reads_a_query_off_the_map(folder, row):
     dataset = load(folder, f"query_file,ref_files,ref_files_loose,status\n{row}\na.png,a.png,,ok\n")
-    assert right_of(dataset) == {"b.png": (set(), set()), "a.png": ({"a.png"}, set())}
+    assert list_correct(dataset) == {"b.png": (set(), set()), "a.png": ({"a.png"}, set())}
     assert dataset.unscored == 1
 
 
@@ -50,7 +50,7 @@ def test_load_dataset_reads_a_spreadsheet_export_without_some_queries(folder):
     assert [(query.path.name, query.right) for query in dataset.queries] == [("b.png", {"b.png"})]
 
 
-HEAD = "query_file,ref_files,status\n"
+HEADER = "query_file,ref_files,status\n"
 
 
 @pytest.mark.parametrize(
@@ -58,12 +58,12 @@ HEAD = "query_file,ref_files,status\n"
     [
         ("query_file,refs\na.png,a.png\n", ["truth.csv", "lacks the column `ref_files`"]),
         ("", ["truth.csv", "lacks the column `query_file`"]),
-        (HEAD + "a.png,a.png,ok\nz.png,a.png,ok\n", ["truth.csv", "`z.png`", "correct its name"]),
-        (HEAD + "a.png,a.png y.png,ok\n", ["truth.csv", "`y.png`", "correct its name"]),
-        (HEAD + "a.png,a.png,novel\n", ["truth.csv, line 2", "`a.png`", "`novel` but has ref_files"]),
-        (HEAD + "a.png,a.png,ok\na.png,b.png,ok\n", ["truth.csv, line 3", "`a.png`", "keep one"]),
-        (HEAD + "a.png,a.png\n", ["truth.csv, line 2", "fields"]),
-        (HEAD + "a.png,a.png,uncertain\n", ["truth.csv", "no query to score"]),
+        (HEADER + "a.png,a.png,ok\nz.png,a.png,ok\n", ["truth.csv", "`z.png`", "correct its name"]),
+        (HEADER + "a.png,a.png y.png,ok\n", ["truth.csv", "`y.png`", "correct its name"]),
+        (HEADER + "a.png,a.png,novel\n", ["truth.csv, line 2", "`a.png`", "`novel` but has ref_files"]),
+        (HEADER + "a.png,a.png,ok\na.png,b.png,ok\n", ["truth.csv, line 3", "`a.png`", "keep one"]),
+        (HEADER + "a.png,a.png\n", ["truth.csv, line 2", "fields"]),
+        (HEADER + "a.png,a.png,uncertain\n", ["truth.csv", "no query to score"]),
         (b"\xff\xd8\xff\xe0 a JPEG", ["truth.csv", "not a UTF-8 CSV file"]),
     ],
 )
@@ -86,7 +86,7 @@ def write_pictures(folder, names):
         cv2.imwrite(str(folder / name), np.zeros((8, 8), np.uint8))
 
 
-def right_of(dataset):
+def list_correct(dataset):
     return {query.path.name: (set(query.right), set(query.ignored)) for query in dataset.queries}
 
 
@@ -96,7 +96,7 @@ def test_open_folder_reads_utm_coordinates_from_names(tmp_path, inside):
     write_pictures(tmp_path / inside / "database", places)
     queries = tmp_path / inside / "queries"
     write_pictures(queries, ["@500005@4100000@q.jpg", "@510000@4100000@far.jpg"])
-    assert right_of(open_folder(tmp_path, 25)) == {
+    assert list_correct(open_folder(tmp_path, 25)) == {
         "@500005@4100000@q.jpg": (places, set()),
         "@510000@4100000@far.jpg": (set(), set()),
     }
@@ -116,9 +116,9 @@ def test_open_folder_matches_positions_by_distance(tmp_path):
         ]
         (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
     dataset = open_folder(tmp_path, 25)
-    assert right_of(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, set()), "far.jpg": (set(), set())}
+    assert list_correct(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, set()), "far.jpg": (set(), set())}
     assert dataset.unscored == 1
-    assert right_of(open_folder(tmp_path, 4))["q.jpg"] == ({"near.jpg"}, set())
+    assert list_correct(open_folder(tmp_path, 4))["q.jpg"] == ({"near.jpg"}, set())
     with pytest.raises(UsageError, match="--within-m"):
         open_folder(tmp_path, 0.1)
     (tmp_path / "ref" / "positions.csv").unlink()

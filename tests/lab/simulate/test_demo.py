@@ -14,13 +14,13 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 
 
 @pytest.fixture
-def small(monkeypatch):
+def coarse_scene(monkeypatch):
     monkeypatch.setattr(demo, "make_scene", partial(make_scene, metres_per_pixel=0.5))
     for name, flight in (("plan_mapping_flight", plan_mapping_flight), ("plan_later_flight", plan_later_flight)):
         monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
 
 
-def test_run_demo_maps_flies_and_draws(small, tmp_path):
+def test_run_demo_maps_flies_and_draws(coarse_scene, tmp_path):
     for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "demo.png"):
         (tmp_path / left_over).write_text('{"kind": "query"}\n')
     said = demo.run_demo(tmp_path)

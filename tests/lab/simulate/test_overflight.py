@@ -70,14 +70,14 @@ def test_photograph_ground_is_none_beyond_the_orthophoto_and_refuses_the_horizon
             photograph_ground(orthophoto, HOME, replace(LEVEL, roll_deg=angle_deg), CAMERA, CLEAR, rng)
 
 
-def csv_of(tmp_path, text):
+def write_csv(tmp_path, text):
     path = tmp_path / "track.csv"
     path.write_text(text)
     return path
 
 
 def test_read_shots_has_a_picture_for_each_line(tmp_path):
-    path = csv_of(
+    path = write_csv(
         tmp_path,
         "file,lat,lon,alt,height_m,roll_deg,pitch_deg,yaw_deg\n"
         "a,50.0,11.9,600,80,3,-4,270\nb,,,,,,,\nc,50.001,11.9,,90,,,\nd,50.001,11.902,,90,,,\n",
@@ -114,7 +114,7 @@ def test_read_shots_refuses_a_track_without_path_or_height(tmp_path):
         ("file,lat,lon,height_m\na,50,11,-3\n", "--height-m"),
     ):
         with pytest.raises(UsageError, match=said):
-            read_shots(csv_of(tmp_path, text), None, 20.0)
+            read_shots(write_csv(tmp_path, text), None, 20.0)
     line = write_mission(tmp_path / "line.waypoints", [(0, 50, 11.9, 0), (0, 60, 11.9, 0)])
     with pytest.raises(UsageError, match="--height-m"):
         read_shots(line, None, 20_000.0)

@@ -25,7 +25,7 @@ def make_ground() -> np.ndarray:
     return light_scene(make_scene(3, 400, 240, metres_per_pixel=METRES_PER_PIXEL), LIGHT, 3)
 
 
-class Flown:
+class CameraFlight:
     """A flight with a picture every `every_s`, whose reports are wrong by `attitude_sd` degrees. `refused`: of each."""
 
     def __init__(self, ground, optics=DOWN, every_s=1.0, attitude_sd=0.5):
@@ -41,7 +41,7 @@ class Flown:
     def photograph(self, east_m=200.0, north_m=120.0, height_m=HEIGHT_M, heading_deg=90.0, roll_deg=0.0, pitch_deg=0.0):
         place = {"east_m": east_m, "north_m": north_m, "height_m": height_m}
         pose = CameraPose(**place, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg)
-        return compressed(photograph(self._ground, METRES_PER_PIXEL, pose, CAMERA, LIGHT, self.rng), self.rng)
+        return compress(photograph(self._ground, METRES_PER_PIXEL, pose, CAMERA, LIGHT, self.rng), self.rng)
 
     def see(self, picture, heading_deg=90.0, roll_deg=0.0, pitch_deg=0.0, velocity_m_s=(0.0, 0.0), height_m=HEIGHT_M):
         """Judge a picture; return why it is refused."""
@@ -63,7 +63,7 @@ class Flown:
         return pictures
 
 
-def compressed(picture, rng):
+def compress(picture, rng):
     """The picture as a JPEG of some quality."""
     quality = int(rng.integers(20, 90))
     return cv2.imdecode(cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))[1], cv2.IMREAD_COLOR)
@@ -85,7 +85,7 @@ def at_constant_bitrate(picture, count, kbit_s=200):
         return [frame.to_ndarray(format="bgr24") for frame in box.decode(video=0)]
 
 
-def with_clock(picture, number):
+def draw_clock(picture, number):
     """The picture with a clock that runs, and the numbers of a display."""
     picture = picture.copy()
     text = f"12:00:{number % 60:02d}.{number * 37 % 100:02d}"

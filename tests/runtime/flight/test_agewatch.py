@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, PICTURE, STEP_S, Air, match_at
+from air import HOME, PICTURE, STEP_S, SimFlight, make_match
 from fakes import to_autopilot
 
 from edgevpr.core.geodesy import offset_position
@@ -25,7 +25,7 @@ STRAIGHT = {"turn_s": math.inf}
 HOVER = {"turn_s": math.inf, "speed_m_s": 0.0}
 
 
-class LateAir(Air):
+class LateCameraFlight(SimFlight):
     """A flight whose pictures are `hidden_s` older than they claim, in circles of 2 pi `turn_s` seconds. GPS is lost
     after 30 s, as a wind comes up. `refused`: times of matches that were not used; `off_s`: by how much the last
     frame's time is wrong, and `t_sd_s` what it claims; `errors_sd`: errors of fixes over what they claim."""
@@ -51,7 +51,7 @@ class LateAir(Air):
         frame = age.correct(claimed)
         seen_m = self.way[true_step] + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
-        event = match_at(where, frame.t_mono_s, vehicle, self.said_sd_m, self.places(true_step))
+        event = make_match(where, frame.t_mono_s, vehicle, self.said_sd_m, self.places(true_step))
         picture = LevelledImage(PICTURE, None, replace(event.view, up_deg=self.heading_deg(frame.t_mono_s)))
         heading_deg = self.heading_deg(true_step * STEP_S) + self.rng.normal(0, 1.0)
         event = replace(event, frame=frame, picture=picture, located=replace(event.located, heading_deg=heading_deg))
@@ -78,7 +78,7 @@ class LateAir(Air):
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT, HOVER])
 @pytest.mark.parametrize("hidden_s", [0.0, 0.5])
 def test_pictures_of_a_usual_delay_are_used_and_claims_are_met(path, hidden_s):
-    air = LateAir(hidden_s=hidden_s, **path).fly(60)
+    air = LateCameraFlight(hidden_s=hidden_s, **path).fly(60)
     assert air.refused == []
     assert abs(air.off_s) < 3 * air.t_sd_s
     assert len(air.errors_sd) > 5
@@ -87,7 +87,7 @@ def test_pictures_of_a_usual_delay_are_used_and_claims_are_met(path, hidden_s):
 
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT, HOVER])
 def test_age_watch_keeps_times_and_uncertainty_of_a_local_camera(path):
-    air = LateAir(delay_sd_s=FRAME_TIME_SD_S, **path).fly(60)
+    air = LateCameraFlight(delay_sd_s=FRAME_TIME_SD_S, **path).fly(60)
     assert air.refused == []
     assert air.off_s == pytest.approx(0.0, abs=1e-9)
     assert air.t_sd_s < 0.1
@@ -95,7 +95,7 @@ def test_age_watch_keeps_times_and_uncertainty_of_a_local_camera(path):
 
 @pytest.mark.parametrize(("hidden_s", "within_s"), [(1.0, 0.4), (3.0, 0.3)])
 def test_age_watch_finds_a_delay_in_turns_and_corrects_it(hidden_s, within_s):
-    air = LateAir(hidden_s=hidden_s, **TIGHT_CIRCLE).fly(60)
+    air = LateCameraFlight(hidden_s=hidden_s, **TIGHT_CIRCLE).fly(60)
     assert abs(air.off_s) < within_s
     assert abs(air.off_s) < 3 * air.t_sd_s
     assert np.mean(np.array(air.errors_sd[-20:]) > 3) <= 0.05
@@ -104,7 +104,7 @@ def test_age_watch_finds_a_delay_in_turns_and_corrects_it(hidden_s, within_s):
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT])
 @pytest.mark.parametrize("delay_sd_s", [FRAME_TIME_SD_S, HIDDEN_DELAY_SD_S])
 def test_age_watch_refuses_suddenly_late_images_until_the_delay_is_as_before(path, delay_sd_s):
-    air = LateAir(delay_sd_s=delay_sd_s, **path)
+    air = LateCameraFlight(delay_sd_s=delay_sd_s, **path)
     air.hidden_s, from_s = 3.0, air.t_s
     air.fly(1)
     air.errors_sd.clear()
@@ -120,7 +120,7 @@ def test_age_watch_refuses_suddenly_late_images_until_the_delay_is_as_before(pat
 
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT])
 def test_age_watch_treats_a_frozen_image_as_of_unknown_age(path):
-    air = LateAir(**path)
+    air = LateCameraFlight(**path)
     for _ in range(10):
         air.fly(1)
         air.hidden_s += 1.0
@@ -134,7 +134,7 @@ def test_check_age_reports_once_and_skips_the_match(tmp_path, clock, link):
     autopilot = to_autopilot(link, navigator, clock, log)
     for is_unknown, delay_s in ages:
         navigator.age = SimpleNamespace(judge=lambda _: None, is_unknown=is_unknown, delay_s=delay_s)
-        event = match_at(Position(*HOME), clock(), None, 3.0, (1,))
+        event = make_match(Position(*HOME), clock(), None, 3.0, (1,))
         events.append(autopilot.check_age(event))
         summaries.append(autopilot.age_summary)
     assert [event.accepted for event in events] == [True, False, False, True]

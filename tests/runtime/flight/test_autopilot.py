@@ -4,7 +4,7 @@ things."""
 import numpy as np
 import pytest
 from fakes import FakeSource
-from flights import flight_over, of_kind, pictures
+from flights import flight_over, pictures, select
 
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW
@@ -12,15 +12,15 @@ from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW
 
 def fixes(lines):
     """Of each query, whether its fix was sent, and why not."""
-    return [fix and (fix["sent"], fix["why"]) for fix in (line["fix"] for line in of_kind(lines, "query"))]
+    return [fix and (fix["sent"], fix["why"]) for fix in (line["fix"] for line in select(lines, "query"))]
 
 
 def test_query_line_has_its_fix_and_the_last_answer(make_flight, clock, link):
     lines = make_flight().fly(FakeSource(pictures(3), clock))
     assert fixes(lines) == [(True, None)] * 3
-    first = of_kind(lines, "query")[0]["fix"]
+    first = select(lines, "query")[0]["fix"]
     assert (first["query"], first["lat_deg"], first["lon_deg"]) == ("frame 000000", 50.0, 8.0)
-    assert [line["result"] for line in of_kind(lines, "answer")] == ["ACCEPTED"] * 3
+    assert [line["result"] for line in select(lines, "answer")] == ["ACCEPTED"] * 3
     assert link.stats().fixes_sent == 3
 
 
@@ -28,7 +28,7 @@ def test_answer_line_precedes_the_next_query(make_flight, clock, link, statuses)
     link.answer = "FAILED"
     lines = make_flight().fly(FakeSource(pictures(4), clock))
     assert [line["kind"] for line in lines if line["kind"] in ("query", "answer")] == ["query", "answer"] * 4
-    queries, answers = of_kind(lines, "query"), of_kind(lines, "answer")
+    queries, answers = select(lines, "query"), select(lines, "answer")
     assert [line["query"] for line in answers] == [line["query"] for line in queries]
     assert {(line["sent"], line["result"], line["why"]["code"]) for line in answers} == {(True, "FAILED", "GPS_IN_USE")}
     assert "3 fixes sent, 0 accepted, 3 refused (GPS in use)" in statuses[-1]
@@ -36,8 +36,8 @@ def test_answer_line_precedes_the_next_query(make_flight, clock, link, statuses)
 
 def test_fix_not_sent_expects_no_answer(make_flight, clock):
     lines = make_flight(**{"mavlink.send_fixes": False}).fly(FakeSource(pictures(3), clock))
-    assert len(of_kind(lines, "query")) == 3
-    assert not of_kind(lines, "answer")
+    assert len(select(lines, "query")) == 3
+    assert not select(lines, "answer")
 
 
 def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, statuses):
@@ -45,7 +45,7 @@ def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, st
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
     lines = flown.fly(FakeSource(pictures(3), clock))
-    assert all(line["accepted"] for line in of_kind(lines, "query")), "accepted never means sent"
+    assert all(line["accepted"] for line in select(lines, "query")), "accepted never means sent"
     assert fixes(lines) == [(False, {"code": "FRAME_TOO_OLD", "parameters": {"age_s": 6.2, "limit_s": 5.0}})] * 3
     assert link.stats().fixes_sent == 0
     assert "2 too late" in statuses[-1]
@@ -54,7 +54,7 @@ def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, st
 def test_fix_without_a_link_is_reported(recording, tmp_path, clock):
     lines = flight_over(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
     assert fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
-    assert not of_kind(lines, "answer")
+    assert not select(lines, "answer")
 
 
 def test_refused_match_has_no_fix(make_flight, clock, link):
@@ -76,7 +76,7 @@ def test_query_cost_is_sent_for_each_query(make_flight, clock, link):
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
 def test_confidence_of_an_accepted_match_is_sent_if_known(make_flight, clock, link, technique):
     lines = make_flight(technique).fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
-    queries = of_kind(lines, "query")
+    queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, True, False]
     told = [each.value for each in link.sent if getattr(each, "name", "") == "vpr_conf"]
     known = [
@@ -99,13 +99,13 @@ def test_camera_lost_is_announced_and_critical_until_it_is_back(make_flight, clo
     lines = make_flight().fly(source)
     assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "ACTIVE"]
     assert link.texts() == [(4, "edgevpr: camera lost"), (6, "edgevpr: camera is back")]
-    assert [line["condition"] for line in of_kind(lines, "source")] == ["LOST", "RUNNING"]
+    assert [line["condition"] for line in select(lines, "source")] == ["LOST", "RUNNING"]
 
 
 def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, caplog):
     link.send_fix = lambda fix: 1 / 0
     lines = make_flight().fly(FakeSource(pictures(2), clock))
-    assert len(of_kind(lines, "query")) == 2
+    assert len(select(lines, "query")) == 2
     assert sum("could not be sent to the autopilot" in record.message for record in caplog.records) == 2
 
 
@@ -113,12 +113,12 @@ def test_blank_images_are_reported_once_after_ten_and_so_is_the_ground_again(mak
     health, ground = [], pictures(1, first=1)
     seen = [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3]
     lines = make_flight().fly(FakeSource(seen, clock, work=lambda: health.append(link.health)))
-    queries = of_kind(lines, "query")
+    queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * 15, *[True] * 3]
     assert all(line["reason"]["code"] == "LOW_TEXTURE" for line in queries[1:16])
     assert queries[1]["fix"] is queries[1]["place"] is None
     assert [severity for severity, _ in link.texts()] == [4, 6]
-    assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["IMAGE_BLANK", "GROUND_VISIBLE"]
+    assert [line["note"]["code"] for line in select(lines, "camera")] == ["IMAGE_BLANK", "GROUND_VISIBLE"]
     assert [health[number] for number in (MAX_BLANK_IN_A_ROW, 15, -1)] == [
         Health.ACTIVE,
         Health.CRITICAL,

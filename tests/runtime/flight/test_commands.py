@@ -2,14 +2,14 @@
 
 import pytest
 from fakes import FakeSource
-from flights import of_kind, pictures
+from flights import pictures, select
 
 from edgevpr.mavlink.ground import UserCommand
 from edgevpr.runtime.flight import systemd
 
 
 def queries(lines):
-    return [line["query"] for line in of_kind(lines, "query")]
+    return [line["query"] for line in select(lines, "query")]
 
 
 def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_flight, clock, link):
@@ -26,7 +26,7 @@ def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_
     assert queries(lines) == ["frame 000000", "frame 000001", "frame 000005", "frame 000006"]
     assert health == ["ACTIVE", "ACTIVE", "STANDBY", "STANDBY", "STANDBY", "ACTIVE", "ACTIVE"]
     assert link.stats().fixes_sent == 4
-    assert [(line["command"], line["sender"], line["note"]["code"]) for line in of_kind(lines, "command")] == [
+    assert [(line["command"], line["sender"], line["note"]["code"]) for line in select(lines, "command")] == [
         ("PAUSE", "255/190", "PAUSED_BY_COMMAND"),
         ("RESUME", "255/190", "RESUMED_BY_COMMAND"),
     ]

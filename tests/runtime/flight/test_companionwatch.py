@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 from fakes import FakeSource
-from flights import flight_meter, of_kind
+from flights import flight_meter, select
 from pictures import textured
 
 from edgevpr.cli.top import format_status
@@ -21,7 +21,7 @@ UNKNOWN = ThermalState(temperature_c=None, frequency_mhz=None, throttled=None, w
 
 
 @pytest.fixture
-def watch(notifier, link):
+def watch_states(notifier, link):
     """Let states be read each second; return (second, severity, text) of all that is sent to the ground station."""
 
     def watched(states):
@@ -34,24 +34,24 @@ def watch(notifier, link):
     return watched
 
 
-def test_companion_watch_reports_a_problem_at_its_start_and_end(watch):
-    assert watch([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
+def test_companion_watch_reports_a_problem_at_its_start_and_end(watch_states):
+    assert watch_states([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
         (5, Severity.WARNING, "edgevpr: companion under-voltage: check 5 V supply"),
         (134, Severity.INFO, "edgevpr: companion supply is back to normal"),
     ]
 
 
 @pytest.mark.parametrize("apart", [2, 7, 29, 31, 45])
-def test_companion_watch_reports_an_intermittent_problem_at_most_once_in_30_seconds(watch, apart):
-    found = watch(([LOW] + [FINE] * (apart - 1)) * (600 // apart))
+def test_companion_watch_reports_an_intermittent_problem_at_most_once_in_30_seconds(watch_states, apart):
+    found = watch_states(([LOW] + [FINE] * (apart - 1)) * (600 // apart))
     times = [time for time, *_ in found]
     assert all(later - earlier >= 30 for earlier, later in pairwise(times))
     assert len(found) == 1 or apart > 30
 
 
-def test_companion_watch_ignores_an_unknown_value(watch):
-    assert watch([UNKNOWN] * 100) == []
-    assert [severity for _, severity, _ in watch([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
+def test_companion_watch_ignores_an_unknown_value(watch_states):
+    assert watch_states([UNKNOWN] * 100) == []
+    assert [severity for _, severity, _ in watch_states([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
 
 
 def test_companion_watch_reports_under_voltage_everywhere(make_flight, clock, link, tree, caplog):
@@ -65,7 +65,7 @@ def test_companion_watch_reports_under_voltage_everywhere(make_flight, clock, li
 
     meter = flight_meter(flight, machine=Machine(flight.board, ThermalWatch(root)))
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * 45, clock), meter, status=Status())
-    notes = [(line["note"]["code"], line["why"]) for line in of_kind(lines, "companion")]
+    notes = [(line["note"]["code"], line["why"]) for line in select(lines, "companion")]
     begun = str(Reason(ReasonCode.UNDER_VOLTAGE))
     signs = "under-voltage, throttled now"
     assert notes[:2] == [("UNDER_VOLTAGE", signs), ("THROTTLED", signs)]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
-from flights import STEP_DEG, Flight, of_kind
+from flights import STEP_DEG, Flight, select
 from pictures import textured
 
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -29,7 +29,7 @@ def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
     lines = flight.fly(FakeSource([textured(number, 240, 320) for number in pictures], clock))
-    return of_kind(lines, "query"), link
+    return select(lines, "query"), link
 
 
 def test_gate_fix_logs_and_announces_a_held_fix_once_in_flight(recording, tmp_path):
@@ -46,7 +46,7 @@ def test_gate_fix_logs_and_announces_a_held_fix_once_in_flight(recording, tmp_pa
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
 
 
-def compared(off_m, t_s, places=1, *, path_m=0.0, predicted_m=0.0, error_deg=None):
+def make_fix(off_m, t_s, places=1, *, path_m=0.0, predicted_m=0.0, error_deg=None):
     """A fix off to the east, whose covariance is 5.5 m2 and that of its prediction 30.5 m2: together 6 m."""
     places = places if isinstance(places, tuple) else (places,)
     frame = FrameMeasurement(t_s=START_S + t_s, sd_m=0.0)
@@ -57,7 +57,7 @@ def compared(off_m, t_s, places=1, *, path_m=0.0, predicted_m=0.0, error_deg=Non
     return PredictedFix(match=match, covariance_m2=30.5 * np.eye(2), **vectors_m)
 
 
-def verdict_of(result):
+def abbreviate(result):
     """ "." for a fix that is believed as expected, "a" against the path, "l" against a lost one, "h" if it is held."""
     verdicts = {(False, False, False): ".", (False, True, False): "a", (False, True, True): "l"}
     held = result.reason is not None
@@ -101,15 +101,15 @@ def verdict_of(result):
 def test_consistency_accepts_a_fix_that_others_confirm_within_limits(fixes, is_tracked, verdicts):
     judge = Consistency()
     results = [
-        judge.judge(compared(*each[:3], **dict(*each[3:])), has_gps=False, is_tracked=is_tracked) for each in fixes
+        judge.judge(make_fix(*each[:3], **dict(*each[3:])), has_gps=False, is_tracked=is_tracked) for each in fixes
     ]
-    assert "".join(map(verdict_of, results)) == verdicts
+    assert "".join(map(abbreviate, results)) == verdicts
 
 
 def test_consistency_rejects_any_fix_against_gps():
     judge = Consistency()
     for second in range(6):
-        reason = judge.judge(compared(500.0, second, second), has_gps=True, is_tracked=False).reason
+        reason = judge.judge(make_fix(500.0, second, second), has_gps=True, is_tracked=False).reason
         assert reason == Reason(ReasonCode.HELD_OFF_GPS, {"distance_m": 500.0})
     assert not judge.is_contradicted(START_S + 5, is_tracked=False)
 
@@ -119,18 +119,18 @@ def test_consistency_is_in_doubt_until_another_should_have_agreed(is_tracked, go
     judge = Consistency()
     assert not judge.is_contradicted(START_S, is_tracked)
     for t_s in range(8):
-        reason = judge.judge(compared(-100, t_s), has_gps=False, is_tracked=is_tracked).reason
+        reason = judge.judge(make_fix(-100, t_s), has_gps=False, is_tracked=is_tracked).reason
         assert reason == Reason(ReasonCode.HELD_OFF_PATH, {"distance_m": 100.0, "accuracy_m": math.sqrt(30.5)})
     assert judge.is_contradicted(START_S + 7 + good_for_s, is_tracked)
     assert not judge.is_contradicted(START_S + 7.1 + good_for_s, is_tracked), "no other has agreed"
-    assert judge.judge(compared(0.0, 9), has_gps=False, is_tracked=is_tracked).reason is None
+    assert judge.judge(make_fix(0.0, 9), has_gps=False, is_tracked=is_tracked).reason is None
     assert not judge.is_contradicted(START_S + 9, is_tracked)
 
 
 @pytest.mark.parametrize(("before_deg", "error_deg"), [(100.0, 0.0), (0.0, 100.0)])
 def test_consistency_reports_the_rotation_of_an_image(before_deg, error_deg):
     judge = Consistency()
-    judge.judge(compared(0.0, 0, error_deg=before_deg), has_gps=True, is_tracked=False)
+    judge.judge(make_fix(0.0, 0, error_deg=before_deg), has_gps=True, is_tracked=False)
     for has_gps in (True, False):
-        reason = judge.judge(compared(0.0, 1, error_deg=error_deg), has_gps=has_gps, is_tracked=False).reason
+        reason = judge.judge(make_fix(0.0, 1, error_deg=error_deg), has_gps=has_gps, is_tracked=False).reason
         assert reason == Reason(ReasonCode.HELD_ROTATED, {"rotation_deg": error_deg})

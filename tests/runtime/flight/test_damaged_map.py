@@ -10,7 +10,7 @@ from functools import partial
 
 import pytest
 from fakes import FakeSource
-from flights import PLACES, STEP_DEG, Flight, fly_acts, nothing, of_kind
+from flights import PLACES, STEP_DEG, Flight, fly_acts, noop, select
 from map_writer import write_sql
 from pictures import textured
 
@@ -21,7 +21,7 @@ DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b
 COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
 
 
-def mapped(line):
+def is_mapped(line):
     """Whether a line's position is that of its place, as the map has it."""
     position = line["position"]
     return position is None or round((position["lat_deg"] - 50) / STEP_DEG) + 1 == line["place"]
@@ -31,7 +31,7 @@ def mapped(line):
 @pytest.mark.parametrize("place", [1, 2, 3, 7, PLACES])
 def test_damaged_fine_part_costs_one_query_and_then_only_queries_that_may_show_it(place_map, tmp_path, place):
     damage = partial(write_sql, place_map, f"UPDATE places SET fine = x'00' WHERE place_id = {place}")
-    queries, lines, flight = fly_acts(place_map, tmp_path / "log", [nothing, damage, *[nothing] * 10])
+    queries, lines, flight = fly_acts(place_map, tmp_path / "log", [noop, damage, *[noop] * 10])
     assert len(queries) == 12
     assert queries[0]["accepted"]
     assert (queries[1]["accepted"], queries[1]["fix"]) == (False, None)
@@ -39,12 +39,12 @@ def test_damaged_fine_part_costs_one_query_and_then_only_queries_that_may_show_i
     for shown, line in enumerate(queries[2:], start=3):
         if line["accepted"]:
             assert line["place"] == shown
-            assert mapped(line)
+            assert is_mapped(line)
         else:
             assert place == shown or line["reason"]["code"] == "PLACE_UNREAD"
     assert sum(line["accepted"] for line in queries[2:]) >= 4, "the flight goes on with the rest"
     assert flight.end["unusable"] == 1
-    assert [(line["place"], line["problem"]) for line in of_kind(lines, "left out")] == [
+    assert [(line["place"], line["problem"]) for line in select(lines, "left out")] == [
         (place, "its fine part has the wrong size")
     ]
     assert flight.link.texts() == [(4, "edgevpr: map damaged, 1 place left out")]
@@ -71,7 +71,7 @@ def test_damaged_columns_never_end_the_flight_or_send_a_position_outside_the_map
     assert sent == sum(line["accepted"] and bool(line["fix"]["sent"]) for line in queries)
     for line in queries:
         if line["fix"] and line["fix"]["sent"]:
-            assert mapped(line)
+            assert is_mapped(line)
 
 
 def test_failures_are_critical_and_reported_once_after_ten_until_recovery(place_map, tmp_path, clock, link, caplog):
@@ -84,15 +84,15 @@ def test_failures_are_critical_and_reported_once_after_ten_until_recovery(place_
 
     flight = Flight(place_map, tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
     calls = iter(
-        [nothing, damage, *[look] * MAX_FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look]
+        [noop, damage, *[look] * MAX_FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look]
     )
     count = MAX_FAILURES_IN_A_ROW + 6
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
-    queries = of_kind(lines, "query")
+    queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * (MAX_FAILURES_IN_A_ROW + 1), *[True] * 4]
     assert health[-4] is Health.CRITICAL
     assert health[0] is health[-1] is Health.ACTIVE
-    assert [line["note"]["code"] for line in of_kind(lines, "failing")] == ["FRAMES_FAILING", "FRAMES_RECOVERED"]
+    assert [line["note"]["code"] for line in select(lines, "failing")] == ["FRAMES_FAILING", "FRAMES_RECOVERED"]
     assert link.texts() == [
         (4, "edgevpr: map cannot be read, see the log"),
         (4, "edgevpr: 10 frames in a row have failed"),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fakes import FakeClock
-from full_disk import no_file_larger_than
+from full_disk import limit_file_size
 
 from edgevpr.core.appending import list_numbered
 from edgevpr.core.config import load_config
@@ -43,7 +43,7 @@ def path(tmp_path) -> Path:
 
 
 @pytest.fixture
-def syncs(monkeypatch) -> list[int]:
+def sync_calls(monkeypatch) -> list[int]:
     """The calls of fdatasync, which still happen."""
     calls = []
     fdatasync = os.fdatasync
@@ -51,7 +51,7 @@ def syncs(monkeypatch) -> list[int]:
     return calls
 
 
-def kinds(path: Path) -> list[str]:
+def read_kinds(path: Path) -> list[str]:
     """Kinds of all lines, each of which must be whole."""
     return [json.loads(line)["kind"] for line in path.read_bytes().splitlines()]
 
@@ -96,20 +96,20 @@ def test_create_logs_program_configuration_and_map_in_the_first_line(path):
     assert record["version"]
 
 
-def test_flight_log_syncs_at_most_once_a_second_and_at_the_end(path, syncs):
+def test_flight_log_syncs_at_most_once_a_second_and_at_the_end(path, sync_calls):
     clock = FakeClock()
     log = FlightLog(path, clock)
     for _ in range(9):  # two seconds at four lines a second
         log.write("match")
         clock.now_s += 0.25
-    assert len(syncs) == 3
+    assert len(sync_calls) == 3
     log.write("match")
     for waited_s, count in ((0.0, 3), (1.0, 4), (1.0, 4)):  # a line that no other follows, then none
         clock.now_s += waited_s
         log.sync_if_due(clock())
-        assert len(syncs) == count
+        assert len(sync_calls) == count
     log.close()
-    assert len(syncs) == 5
+    assert len(sync_calls) == 5
 
 
 def test_sync_if_due_records_an_error_between_lines_without_raising(path, monkeypatch, caplog):
@@ -123,7 +123,7 @@ def test_sync_if_due_records_an_error_between_lines_without_raising(path, monkey
             log.sync_if_due(clock())
         assert "No space" in log.fault
         log.write("third")
-    assert kinds(path) == ["first", "second", "gap", "third"]
+    assert read_kinds(path) == ["first", "second", "gap", "third"]
 
 
 def test_read_log_skips_a_truncated_last_line_and_invalid_records(path):
@@ -138,14 +138,14 @@ def test_write_resumes_without_a_partial_line_once_the_disk_has_space(path, capl
     log = FlightLog(path)
     log.write("before")
     whole = path.read_bytes()
-    with no_file_larger_than(len(whole) + 10):
+    with limit_file_size(len(whole) + 10):
         log.write("lost")
         log.write("lost")
         assert path.read_bytes() == whole
         assert log.fault
     log.write("after")
     log.close()
-    assert kinds(path) == ["before", "gap", "after"]
+    assert read_kinds(path) == ["before", "gap", "after"]
     assert next(r for r in read_log(path) if r["kind"] == "gap")["lost_lines"] == 2
     assert (log.fault, log.lost_lines) == (None, 2)
     said = [record.getMessage() for record in caplog.records]
@@ -166,7 +166,7 @@ def test_flight_log_is_readable_by_owner_and_group_under_any_umask(umask, path):
     assert path.stat().st_mode & 0o777 == 0o600
 
 
-def flown(log, clock, *names):
+def write_names(log, clock, *names):
     for name in names:
         log.write(name)
         clock.now_s += 0.5
@@ -176,10 +176,10 @@ def flown(log, clock, *names):
 def test_flight_log_continues_in_a_new_file_if_deleted_or_moved(path, caplog, taken_away):
     clock = FakeClock()
     with FlightLog(path, clock) as log:
-        flown(log, clock, "start", "a", "b")
+        write_names(log, clock, "start", "a", "b")
         taken_away(path)
-        flown(log, clock, "c", "d", "e")
-    assert kinds(path) == ["start", "c", "d", "e"]
+        write_names(log, clock, "c", "d", "e")
+    assert read_kinds(path) == ["start", "c", "d", "e"]
     assert len(caplog.records) == 1
     assert select_last_flight(path).missing
 
@@ -214,7 +214,7 @@ def numbers(path: Path) -> list[int]:
     return [record["n"] for record in read_log(path) if record["kind"] == "query"]
 
 
-def written(path: Path, count: int, begin: int = 0, **settings) -> FlightLog:
+def write(path: Path, count: int, begin: int = 0, **settings) -> FlightLog:
     with FlightLog(path, max_mb=4 * PART_MB, **settings) as log:
         log.write("start", version="1")
         for n in range(begin, begin + count):
@@ -222,40 +222,40 @@ def written(path: Path, count: int, begin: int = 0, **settings) -> FlightLog:
     return log
 
 
-def parts(path: Path) -> list[Path]:
+def list_parts(path: Path) -> list[Path]:
     return [*list_numbered(path), path]
 
 
 def test_flight_log_continues_in_a_new_readable_file_when_full(path, caplog):
-    written(path, 120)
-    assert [each.name for each in parts(path)] == ["flight-0001.jsonl", "flight-0002.jsonl", "flight.jsonl"]
-    assert [n for part in parts(path) for n in numbers(part)] == list(range(120))
-    (start,), *again = ([each for each in read_log(part) if each["kind"] == "start"] for part in parts(path))
+    write(path, 120)
+    assert [each.name for each in list_parts(path)] == ["flight-0001.jsonl", "flight-0002.jsonl", "flight.jsonl"]
+    assert [n for part in list_parts(path) for n in numbers(part)] == list(range(120))
+    (start,), *again = ([each for each in read_log(part) if each["kind"] == "start"] for part in list_parts(path))
     assert again == [[{**start, "repeated": True, "part": part}] for part in (2, 3)]
-    assert {kinds(part)[0] for part in parts(path)} == {"start"}
+    assert {read_kinds(part)[0] for part in list_parts(path)} == {"start"}
     assert not caplog.records
 
 
 def test_flight_log_deletes_the_oldest_files_beyond_the_limit(path):
     for flight in range(10):
-        written(path, 100, 100 * flight)
+        write(path, 100, 100 * flight)
         assert sum(part.stat().st_size for part in list_numbered(path)) <= 3e6 * PART_MB, "the newest may grow"
-    assert all(part.stat().st_size <= 1e6 * PART_MB for part in parts(path))
-    kept = [n for part in parts(path) for n in numbers(part)]
+    assert all(part.stat().st_size <= 1e6 * PART_MB for part in list_parts(path))
+    kept = [n for part in list_parts(path) for n in numbers(part)]
     assert kept == list(range(kept[0], 1000))
     assert kept[0] < 900, "the flight before is there still, in part"
-    assert {kinds(part)[0] for part in parts(path)} == {"start"}
-    assert {part.stat().st_mode & 0o777 for part in parts(path)} == {0o640}
+    assert {read_kinds(part)[0] for part in list_parts(path)} == {"start"}
+    assert {part.stat().st_mode & 0o777 for part in list_parts(path)} == {0o640}
 
 
-def refusing(*_: object, **more: object) -> None:
+def refuse(*_: object, **more: object) -> None:
     raise OSError(30, "Read-only file system")
 
 
 def test_flight_log_continues_in_a_file_that_cannot_be_renamed_and_reports_it_once(path, caplog, monkeypatch):
-    monkeypatch.setattr(os, "replace", refusing)
-    written(path, 100)
-    log = written(path, 100, 100)
+    monkeypatch.setattr(os, "replace", refuse)
+    write(path, 100)
+    log = write(path, 100, 100)
     assert numbers(path) == list(range(200))
     assert not list_numbered(path), "no number is left without a file"
     assert (log.fault, log.lost_lines) == (None, 0)
@@ -278,16 +278,16 @@ def test_flight_log_refuses_a_log_in_use_and_a_service_waits_for_it(path):
         first.write("query", n=0)
     second.write("query", n=2)
     second.close()
-    assert [kinds(part) for part in parts(path)] == [["start", "query"], ["gap", "query"]]
+    assert [read_kinds(part) for part in list_parts(path)] == [["start", "query"], ["gap", "query"]]
 
 
 def test_flight_log_repeats_a_lost_start_line(path):
     with FlightLog(path) as log:
-        with no_file_larger_than(10):
+        with limit_file_size(10):
             log.write("start", version="1")
         log.write("query", n=1)
         log.write("query", n=2)
-    assert kinds(path) == ["start", "gap", "query", "query"]
+    assert read_kinds(path) == ["start", "gap", "query", "query"]
     assert select_last_flight(path).missing is None
 
 
@@ -304,7 +304,7 @@ def test_flight_log_loses_no_line_and_no_file_at_kill_9(path):
             said.append(writing.stdout.readline())
         writing.kill()
         said += writing.communicate()[0].split()
-        kept = [n for part in parts(path) if part.exists() for n in numbers(part)]
+        kept = [n for part in list_parts(path) if part.exists() for n in numbers(part)]
         assert kept == list(range(kept[0], kept[-1] + 1))
         assert kept[-1] >= int(said[-1]), "what was written is there"
         assert kept[-1] - kept[0] > 20

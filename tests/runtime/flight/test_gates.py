@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, match_at
+from air import HOME, make_match
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import offset_m, offset_position
@@ -25,10 +25,10 @@ from edgevpr.runtime.recognise.perspective import AttitudeError
 
 NOW_S = 1000.0
 NEVER_S = math.inf
-LIKE_ONE = math.sqrt(50)
+INFLATION = math.sqrt(50)
 
 
-class Known:
+class KnownNavigation:
     """What navigation says of the position: `off_m` (2,) from HOME, so many metres and seconds ago."""
 
     def __init__(self, *, off_m=(0.0, 0.0), accuracy_m=2.0, shown_ago_s=0.0, gps_ago_s=NEVER_S, drift_m_s=(0.0, 0.0)):
@@ -72,15 +72,15 @@ def navigate(channel=Channel.COMMAND, *, reports=None, is_heard=True, map_sd_m=1
     """A navigator that knows its position, beside an autopilot without GPS that `reports`."""
     navigator = Navigator(map_sd_m, every_s, **how or {})
     navigator.handle_channel(channel)
-    navigator._navigation = Known(**known)
+    navigator._navigation = KnownNavigation(**known)
     if is_heard:
         said = {"has_gps": False, "velocity_m_s": (0.0, 0.0)} | (reports or {})
         navigator.handle_vehicle(vehicle_at(*HOME, said.pop("t_received_s", NOW_S), **said))
     return navigator
 
 
-def matched(**changes):
-    return replace(match_at(Position(*HOME), NOW_S, None, 1.5, (1,)), **changes)
+def fake_match(**changes):
+    return replace(make_match(Position(*HOME), NOW_S, None, 1.5, (1,)), **changes)
 
 
 GPS = {"has_gps": True}
@@ -165,9 +165,9 @@ def test_continuous_position_claims_the_accuracy_of_fifty_correlated_ones():
     assert (state.lat_deg, state.lon_deg) == pytest.approx(HOME)
     assert state.velocity_m_s == (3.0, 4.0, 0.7)
     assert state.attitude == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
-    assert (state.accuracy_m, state.speed_accuracy_m_s) == pytest.approx((2.0 * LIKE_ONE, 0.5 * LIKE_ONE))
+    assert (state.accuracy_m, state.speed_accuracy_m_s) == pytest.approx((2.0 * INFLATION, 0.5 * INFLATION))
     navigator._navigation.off_m = (3.0 + 10.0, 4.0)  # as far as it has flown, and 10 m of which 2 m are made up
-    assert navigator.estimate_state(NOW_S + 1.0).accuracy_m == pytest.approx(math.hypot(2.0, 8.0) * LIKE_ONE, rel=1e-4)
+    assert navigator.estimate_state(NOW_S + 1.0).accuracy_m == pytest.approx(math.hypot(2.0, 8.0) * INFLATION, rel=1e-4)
     bare = navigate(Channel.GPS_INPUT).estimate_state(NOW_S)
     assert (bare.attitude, bare.velocity_m_s[2]) == (None, 0.0)
 
@@ -183,18 +183,18 @@ def test_fallback_position_has_the_altitude_of_the_receiver(sd_m, alt_m, expecte
 @pytest.mark.parametrize(
     ("channel", "how", "shown_ago_s", "factor"),
     [
-        (Channel.SENSOR, {}, None, LIKE_ONE),
+        (Channel.SENSOR, {}, None, INFLATION),
         (Channel.SENSOR, {"is_level": True}, None, 1.5),
-        (Channel.GPS_INPUT, {"is_level": True}, None, LIKE_ONE),
+        (Channel.GPS_INPUT, {"is_level": True}, None, INFLATION),
         (Channel.SENSOR, {}, 5.0, 1.5),
-        (Channel.SENSOR, {}, 5.1, LIKE_ONE),
+        (Channel.SENSOR, {}, 5.1, INFLATION),
     ],
 )
 def test_px4_gets_uninflated_errors_while_images_show_its_attitude(channel, how, shown_ago_s, factor):
     navigator = navigate(channel, how=how)
     if shown_ago_s:
         lean = AttitudeError((0.01, 0.0), 0.01)
-        navigator.advise(match_at(Position(*HOME), NOW_S - shown_ago_s, None, 1.5, (1,), lean=lean), NOW_S)
+        navigator.advise(make_match(Position(*HOME), NOW_S - shown_ago_s, None, 1.5, (1,), lean=lean), NOW_S)
     assert navigator.estimate_state(NOW_S).accuracy_m == pytest.approx(2.0 * factor)
 
 
@@ -226,12 +226,12 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
 
 def test_frame_claims_a_height_error_shown_by_images():
     navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
-    navigator.handle_frame(matched())
+    navigator.handle_frame(fake_match())
     navigator.correct_height(1.2, 0.1)
-    navigator.handle_frame(matched(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
+    navigator.handle_frame(fake_match(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
     navigator.correct_height(1.0, 0.3)
-    navigator.handle_frame(matched())
-    navigator.handle_frame(matched(frame=None))
+    navigator.handle_frame(fake_match())
+    navigator.handle_frame(fake_match(frame=None))
     frames = navigator._navigation.frames
     assert [frame.sd_m for frame, _ in frames] == pytest.approx([50 * FRAME_TIME_SD_S, 0.0, 50 * FRAME_TIME_SD_S])
     assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.2, 0.3])
@@ -261,7 +261,7 @@ TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(Reas
 def test_match_is_sent_only_if_allowed(channel, reports, event, contradicts_m, code):
     navigator = navigate(channel, reports=reports)
     navigator._navigation.contradicts_m = contradicts_m
-    advice = navigator.advise(matched(**event), NOW_S)
+    advice = navigator.advise(fake_match(**event), NOW_S)
     assert (advice.why and advice.why.code) is code
     assert advice.is_held is (code is ReasonCode.HELD_OFF_PATH)
     assert len(navigator._navigation.begun) == (contradicts_m is None)
@@ -271,10 +271,10 @@ def test_match_is_sent_only_if_allowed(channel, reports, event, contradicts_m, c
 
 def test_accuracy_of_a_fix_contains_the_error_of_its_time():
     navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
-    late = replace(matched().frame, t_sd_s=math.hypot(FRAME_TIME_SD_S, 0.1))
-    navigator.advise(matched(frame=late), NOW_S)
+    late = replace(fake_match().frame, t_sd_s=math.hypot(FRAME_TIME_SD_S, 0.1))
+    navigator.advise(fake_match(frame=late), NOW_S)
     assert navigator.accuracy_m(NOW_S) == pytest.approx(math.hypot(1.0, 5.0))
-    unheard = navigate(is_heard=False).advise(matched(frame=late), NOW_S)
+    unheard = navigate(is_heard=False).advise(fake_match(frame=late), NOW_S)
     assert unheard.fix.accuracy_m == pytest.approx(1.5 * math.sqrt(2)), "an unknown speed is 15 m/s"
 
 
@@ -283,19 +283,19 @@ def test_autopilot_gets_nothing_in_its_first_five_seconds(is_heard):
     navigator = navigate(is_heard=is_heard, reports={"t_received_s": NOW_S - 5.0})
     if not is_heard:
         navigator.handle_autopilot(NOW_S - 5.0)
-    assert navigator.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
-    assert navigator.advise(matched(), NOW_S + 0.1).fix
+    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
+    assert navigator.advise(fake_match(), NOW_S + 0.1).fix
 
 
 def test_fix_is_sent_if_it_improves_the_autopilots_position():
     reports = {"velocity_m_s": (10.0, -4.0), "t_received_s": NOW_S - 0.5}
-    same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(matched(), NOW_S)
+    same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(fake_match(), NOW_S)
     assert same.why.code is ReasonCode.NOT_BETTER
     assert same.why.parameters == pytest.approx({"distance_m": 0.0, "accuracy_m": 2.0}, abs=0.01)
-    assert navigate(accuracy_m=3.0, off_m=(4.23, 0.0)).advise(matched(), NOW_S).fix is None
-    assert navigate(accuracy_m=3.0, off_m=(4.25, 0.0)).advise(matched(), NOW_S).fix
+    assert navigate(accuracy_m=3.0, off_m=(4.23, 0.0)).advise(fake_match(), NOW_S).fix is None
+    assert navigate(accuracy_m=3.0, off_m=(4.25, 0.0)).advise(fake_match(), NOW_S).fix
     for every_s, ahead_m in ((1.0, (2.0, -1.5)), (0.2, (0.8, -0.6))):
-        fix = navigate(every_s=every_s, off_m=(10.0, 0.0), drift_m_s=(8.0, -6.0)).advise(matched(), NOW_S).fix
+        fix = navigate(every_s=every_s, off_m=(10.0, 0.0), drift_m_s=(8.0, -6.0)).advise(fake_match(), NOW_S).fix
         assert offset_m(*HOME, fix.lat_deg, fix.lon_deg) == pytest.approx((10.0 + ahead_m[0], ahead_m[1]), abs=0.01)
         assert fix.accuracy_m == pytest.approx(math.hypot(2.0, math.hypot(*ahead_m) / math.sqrt(2)))
         assert fix.t_frame_s == NOW_S
@@ -303,13 +303,13 @@ def test_fix_is_sent_if_it_improves_the_autopilots_position():
 
 def test_navigator_sends_no_fix_with_gps_or_while_the_map_contradicts_it():
     beside, doubted, unknown = (navigate(off_m=(10.0, 0.0), reports=said) for said in (GPS, {}, {}))
-    assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_GPS
+    assert beside.advise(fake_match(), NOW_S).why.code is ReasonCode.HAS_GPS
     beside.trust_gps(False)
-    assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_WRONG_GPS
+    assert beside.advise(fake_match(), NOW_S).why.code is ReasonCode.HAS_WRONG_GPS
     doubted.distrust_map(True)
-    assert doubted.advise(matched(), NOW_S).why.code is ReasonCode.MAP_CONTRADICTS_GPS
+    assert doubted.advise(fake_match(), NOW_S).why.code is ReasonCode.MAP_CONTRADICTS_GPS
     unknown._navigation.accuracy_m = None
-    assert unknown.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
+    assert unknown.advise(fake_match(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
 
 
 @pytest.mark.parametrize(
@@ -337,7 +337,7 @@ def test_navigator_sends_no_interim_fix_if_matches_contradict_or_age_is_unknown(
     navigator.age.is_unknown = True
     assert navigator.make_interim_fix(NOW_S) is None
     navigator.age.is_unknown, navigator._navigation.contradicts_m = False, 500.0
-    assert navigator.advise(matched(), NOW_S).is_held
+    assert navigator.advise(fake_match(), NOW_S).is_held
     assert navigator.make_interim_fix(NOW_S) is None
 
 

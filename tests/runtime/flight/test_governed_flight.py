@@ -2,7 +2,7 @@
 
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, flight_meter, of_kind
+from flights import Flight, flight_meter, select
 from pictures import textured
 
 from edgevpr.runtime.flight.metering import FlightMeter, LoadReading
@@ -15,7 +15,7 @@ CALM = LoadReading(cpu_share=0.01, late_share=0.0, rss_mb=100.0, temperature_c=4
 BUSY = LoadReading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40.0, throttled=False)
 
 
-class Scripted(FlightMeter):
+class ScriptedMeter(FlightMeter):
     """A meter that reads what stands in a script, a reading a turn, and calm after its end."""
 
     def __init__(self, battery, board, clock, *, readings):
@@ -27,18 +27,18 @@ class Scripted(FlightMeter):
         return self._readings[turn] if turn < len(self._readings) else CALM
 
 
-def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
+def govern(place_map, log, readings, count, fewer_candidates=(), **settings):
     """(changes, all lines, announcements, the flight) of a flight of `count` turns of 4 s."""
     clock = FakeClock()
     flight = Flight(place_map, log, clock, FakeLink(clock), **settings)
     source = FakeSource([textured(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
-    lines = flight.fly(source, flight_meter(flight, Scripted, readings=readings), fewer_candidates)
-    return of_kind(lines, "governor"), lines, flight.link.texts(), flight
+    lines = flight.fly(source, flight_meter(flight, ScriptedMeter, readings=readings), fewer_candidates)
+    return select(lines, "governor"), lines, flight.link.texts(), flight
 
 
 def test_governor_change_is_logged_and_announced_once_and_reverted(recording, tmp_path, statuses, caplog):
     script = [BUSY] * 2 + [CALM] * 3
-    changes, _, texts, _ = governed(recording / "cohog.gpkg", tmp_path / "log", script, 8, **{"source.rate_hz": 60.0})
+    changes, _, texts, _ = govern(recording / "cohog.gpkg", tmp_path / "log", script, 8, **{"source.rate_hz": 60.0})
     down, back = changes
     asked, half = {"rate_hz": 60.0, "candidates": 42, "form": None}, {"rate_hz": 30.0, "candidates": 42, "form": None}
     assert (down["from"], down["to"], back["from"], back["to"]) == (asked, half, half, asked)
@@ -56,7 +56,7 @@ def test_governor_lowers_candidates_before_the_rate_in_flight(recording, tmp_pat
     monkeypatch.setattr(
         Recogniser, "step", lambda self, *asked: (compared.append(self.candidates), step(self, *asked))[1]
     )
-    changes, _, texts, _ = governed(
+    changes, _, texts, _ = govern(
         recording / "cohog.gpkg", tmp_path / "log", [BUSY] * 99, 12, (20,), **{"source.rate_hz": 60.0}
     )
     assert [line["to"]["candidates"] for line in changes] == [20] * 5

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from air import HOME, match_at
+from air import HOME, make_match
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import offset_position
@@ -23,7 +23,7 @@ EXACT = 0.6, 0.8  # standard deviations of match and receiver: together 1 m
 USUAL = 3.0, 4.0
 
 
-class Watched:
+class GpsHover:
     """A watch over GPS of an aircraft that stands, with the standard deviations of matches and receiver."""
 
     def __init__(self, sd_m=EXACT, map_sd_m=0.0):
@@ -36,7 +36,7 @@ class Watched:
         t_s = BEGIN_S + after_s
         vehicle = vehicle or vehicle_at(*HOME, t_s, gps=receiver_at(HOME, self.sd_m[1], t_s), **said)
         self.watch.update(
-            match_at(Position(*offset_position(*HOME, off_m, 0.0)), t_s, vehicle, self.sd_m[0], places, view, lean)
+            make_match(Position(*offset_position(*HOME, off_m, 0.0)), t_s, vehicle, self.sd_m[0], places, view, lean)
         )
         return self.watch.is_wrong
 
@@ -50,9 +50,9 @@ class Watched:
 
 @pytest.mark.parametrize(("sd_m", "map_sd_m", "limit_m"), [(EXACT, 0.0, 15.0), (USUAL, 0.0, 20.0), (USUAL, 12.0, 52.0)])
 def test_match_contradicts_gps_beyond_four_standard_deviations(sd_m, map_sd_m, limit_m):
-    assert not Watched(sd_m, map_sd_m).matches(*[limit_m - 0.1] * 3)
-    assert Watched(sd_m, map_sd_m).matches(*[limit_m + 0.1] * 3)
-    assert not Watched(sd_m, map_sd_m).matches(*[limit_m + 0.1] * 2)
+    assert not GpsHover(sd_m, map_sd_m).matches(*[limit_m - 0.1] * 3)
+    assert GpsHover(sd_m, map_sd_m).matches(*[limit_m + 0.1] * 3)
+    assert not GpsHover(sd_m, map_sd_m).matches(*[limit_m + 0.1] * 2)
 
 
 # After 60 matches at 0 m and 60 at 6 m, of which the last 60 count, the mean is 3.81 m.
@@ -63,17 +63,17 @@ def test_match_contradicts_gps_beyond_four_standard_deviations(sd_m, map_sd_m, l
 def test_match_contradicts_gps_that_has_moved_relative_to_earlier_matches(sd_m, before_m, limit_m):
     seconds = len(before_m)
     for beyond_m, is_wrong in ((-0.02, False), (0.02, True)):
-        watched = Watched(sd_m)
+        watched = GpsHover(sd_m)
         watched.matches(*before_m)
         assert watched.matches(*[limit_m + beyond_m] * 3, begin_s=seconds) is is_wrong
 
 
 def test_reset_forgets_how_matches_differed_from_gps():
-    watched = Watched()
+    watched = GpsHover()
     watched.matches(*[0.0] * 10)
     watched.watch.reset()
     assert not watched.matches(*[-7.1] * 3, begin_s=10), "no offset is usual yet"
-    watched = Watched()
+    watched = GpsHover()
     watched.matches(100.0, 100.0)
     watched.watch.reset()
     assert not watched.matches(100.0, 100.0, begin_s=2)
@@ -103,16 +103,16 @@ def test_reset_forgets_how_matches_differed_from_gps():
     ],
 )
 def test_gps_watch_requires_enough_matches_to_call_gps_wrong(matches, is_wrong):
-    watched = Watched(USUAL)
+    watched = GpsHover(USUAL)
     assert [watched.match(*match) for match in matches] == [False] * (len(matches) - 1) + [is_wrong]
 
 
 def test_gps_watch_trusts_gps_again_after_three_agreeing_matches():
-    watched = Watched()
+    watched = GpsHover()
     watched.matches(*[100.0] * 3)
     assert watched.matches(0.0, 0.0, begin_s=3)
     assert not watched.matches(0.0, begin_s=5)
-    jammed = Watched()
+    jammed = GpsHover()
     assert jammed.matches(*[100.0, 0.0] * 4, 100.0)
     assert jammed.matches(0.0, 0.0, 0.0, begin_s=9)
     assert jammed.match(0.0, 20.0, (20,)), "five contradicted it within 20 s"
@@ -121,13 +121,13 @@ def test_gps_watch_trusts_gps_again_after_three_agreeing_matches():
 
 @pytest.mark.parametrize(("agreeing", "trusts_gps"), [(2, True), (3, False)])
 def test_gps_watch_trusts_gps_over_a_map_that_never_agreed(agreeing, trusts_gps):
-    watched = Watched()
+    watched = GpsHover()
     assert watched.matches(*[0.0] * agreeing, *[100.0] * 3)
     assert watched.navigator.trusts_gps() is trusts_gps
 
 
 def test_gps_watch_reports_again_once_the_distance_has_doubled():
-    watched = Watched()
+    watched = GpsHover()
     watched.matches(100.0, 100.0, 100.0, 199.0, 201.0, 202.0, *[0.0] * 25)
     says = [(Severity.WARNING, f"edgevpr: GPS is {off_m} m from the map's position") for off_m in (100, 201)]
     assert watched.link.texts() == [*says, (Severity.INFO, "edgevpr: GPS agrees with the map again")]
@@ -145,7 +145,7 @@ def test_gps_watch_reports_again_once_the_distance_has_doubled():
     ],
 )
 def test_match_may_differ_from_gps_by_its_attitude_error(lean, height_m, is_wrong):
-    watched = Watched()
+    watched = GpsHover()
     for second in range(3):
         found = watched.match(60.0, second, (second,), lean=lean, height_m=height_m)
     assert found is is_wrong
@@ -153,7 +153,7 @@ def test_match_may_differ_from_gps_by_its_attitude_error(lean, height_m, is_wron
 
 def test_match_is_compared_with_the_receiver_position_at_its_time():
     velocity_m_s = 25.0, 0.0
-    watched, where = Watched(), offset_position(*HOME, -25.0 * (0.8 + RECEIVER_LAG_S), 0.0)
+    watched, where = GpsHover(), offset_position(*HOME, -25.0 * (0.8 + RECEIVER_LAG_S), 0.0)
     receiver = receiver_at(where, 1.0, BEGIN_S - 0.8, velocity_m_s=(0.0, 9.0))
     for velocity, off_m in ((velocity_m_s, 0.0), (None, 22.5)):
         watched.match(0.0, 0.0, (1,), vehicle=vehicle_at(*HOME, BEGIN_S, gps=receiver, velocity_m_s=velocity))
@@ -161,11 +161,11 @@ def test_match_is_compared_with_the_receiver_position_at_its_time():
 
 
 def test_gps_watch_skips_what_cannot_be_compared():
-    watched = Watched()
+    watched = GpsHover()
     for vehicle in (vehicle_at(*HOME, BEGIN_S, has_gps=False), vehicle_at(*HOME, BEGIN_S - 1.1)):
         watched.match(0.0, 0.0, (1,), vehicle=vehicle)
     watched.match(0.0, 0.0, (1,), view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
-    here = match_at(Position(*HOME), BEGIN_S, vehicle_at(*HOME, BEGIN_S), 1.0, (1,))
+    here = make_match(Position(*HOME), BEGIN_S, vehicle_at(*HOME, BEGIN_S), 1.0, (1,))
     watched.watch.update(replace(here, vehicle=None))
     watched.watch.update(replace(here, located=None))
     assert watched.distances_m() == []

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from air import GPS_SD_M, HOME, Air, lengths, match_at
+from air import GPS_SD_M, HOME, SimFlight, make_match, norms
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import offset_position
@@ -19,10 +19,10 @@ from edgevpr.runtime.flight.notifier import Notifier
 pytestmark = pytest.mark.slow
 
 MAP_SD_M = 5.0
-AWAY = np.array([0.6, 0.8])
+DRIFT_DIRECTION = np.array([0.6, 0.8])
 
 
-class Watched(Air):
+class GpsFlight(SimFlight):
     """A flight whose every match is told to the autopilot and to the watch over GPS, as the loop does; `news` are the
     watch's lines of the flight log."""
 
@@ -43,7 +43,7 @@ class Watched(Air):
 
     def fly(self, seconds):
         for _ in range(round(seconds)):
-            self.gps_off_m = self.gps_off_m + self.drift_m_s * AWAY
+            self.gps_off_m = self.gps_off_m + self.drift_m_s * DRIFT_DIRECTION
             super().fly(1)
         return self
 
@@ -56,14 +56,14 @@ class Watched(Air):
 
 
 @pytest.fixture
-def watched(tmp_path):
+def make_air(tmp_path):
     """Makes one flight."""
     clock = FakeClock(0.0)
     with FlightLog(tmp_path / "log", clock=clock) as flight_log:
-        yield partial(Watched, flight_log, clock)
+        yield partial(GpsFlight, flight_log, clock)
 
 
-def until_found(air, off_m=30.0):
+def fly_until_alarm(air, off_m=30.0):
     """Fly until the alarm; return the seconds from when GPS was so far off."""
     is_off_s = None if math.hypot(*air.gps_off_m) < off_m else air.t_s
     for _ in range(120):
@@ -75,7 +75,7 @@ def until_found(air, off_m=30.0):
     raise AssertionError("no alarm")
 
 
-def glitch(air, drift_m_s):
+def start_glitch(air, drift_m_s):
     if drift_m_s is None:
         air.gps_off_m = np.array([100.0, 0.0])
     else:
@@ -87,11 +87,11 @@ GLITCHES = pytest.mark.parametrize("drift_m_s", [None, 1.0, 2.0, 5.0], ids=["jum
 
 @GLITCHES
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0])
-def test_gps_watch_detects_jumps_and_drift_within_fifteen_seconds_of_thirty_metres(watched, drift_m_s, fix_sd_m):
-    air = watched(fix_sd_m=fix_sd_m).fly(30)
+def test_gps_watch_detects_jumps_and_drift_within_fifteen_seconds_of_thirty_metres(make_air, drift_m_s, fix_sd_m):
+    air = make_air(fix_sd_m=fix_sd_m).fly(30)
     assert air.news == []
-    glitch(air, drift_m_s)
-    assert until_found(air) < 15
+    start_glitch(air, drift_m_s)
+    assert fly_until_alarm(air) < 15
     air.fly(60)
     news = air.news[0]
     assert all(line["is_wrong"] for line in air.news)
@@ -104,18 +104,18 @@ def test_gps_watch_detects_jumps_and_drift_within_fifteen_seconds_of_thirty_metr
 
 
 @pytest.mark.parametrize(("t_sd_s", "is_wrong"), [(FRAME_TIME_SD_S, True), (1.0, False)])
-def test_gps_watch_allows_for_the_time_of_a_frame(watched, t_sd_s, is_wrong):
+def test_gps_watch_allows_for_the_time_of_a_frame(make_air, t_sd_s, is_wrong):
     """At 15 m/s a second is 15 m: then 30 m prove nothing."""
-    air = watched(t_sd_s=t_sd_s).fly(20)
+    air = make_air(t_sd_s=t_sd_s).fly(20)
     air.gps_off_m = np.array([30.0, 0.0])
     assert air.fly(40).watch.is_wrong is is_wrong
 
 
 @pytest.mark.parametrize("agrees_s", [0, 30])
-def test_map_that_never_agreed_with_gps_is_not_used_after_gps_loss(watched, agrees_s):
+def test_map_that_never_agreed_with_gps_is_not_used_after_gps_loss(make_air, agrees_s):
     """A map whose places lie 300 m beside the true ones contradicts GPS from the first match on, a receiver that is led
     away only later."""
-    air = watched().fly(agrees_s)
+    air = make_air().fly(agrees_s)
     air.gps_off_m = np.array([300.0, 0.0])
     air.fly(30)
     assert air.watch.is_wrong
@@ -126,11 +126,11 @@ def test_map_that_never_agreed_with_gps_is_not_used_after_gps_loss(watched, agre
 
 
 @GLITCHES
-def test_navigation_trusts_fixes_over_wrong_gps_but_sends_none_while_the_autopilot_uses_gps(watched, drift_m_s):
-    air = watched().fly(60)
+def test_navigation_trusts_fixes_over_wrong_gps_but_sends_none_while_the_autopilot_uses_gps(make_air, drift_m_s):
+    air = make_air().fly(60)
     assert air.navigator.has_gps
-    glitch(air, drift_m_s)
-    until_found(air)
+    start_glitch(air, drift_m_s)
+    fly_until_alarm(air)
     air.fly(60)
     assert not air.navigator.has_gps
     off_m = []
@@ -138,7 +138,7 @@ def test_navigation_trusts_fixes_over_wrong_gps_but_sends_none_while_the_autopil
         air.fly(1)
         here = air.navigator._navigation.estimate_state(air.t_s).position
         off_m.append(air.off(here.lat_deg, here.lon_deg))
-    assert lengths(off_m).max() < 8, "where the autopilot is 60 m off and more"
+    assert norms(off_m).max() < 8, "where the autopilot is 60 m off and more"
     assert air.link.stats().fixes_sent == 0
     assert {report.why.code for report in air.reports[-20:]} == {ReasonCode.HAS_WRONG_GPS}
 
@@ -160,13 +160,13 @@ def test_gps_watch_gives_no_false_alarm_in_thirty_minutes_of_noise(fix_sd_m):
             gps = offset_position(*HOME, *(at_m + wander_m))
             known = {"gps": receiver_at(gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
             seen = Position(*offset_position(*HOME, *(at_m + off_m)))
-            watch.update(match_at(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),)))
+            watch.update(make_match(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),)))
             assert not watch.is_wrong
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_gps_watch_detects_slow_drift_within_fifteen_seconds_of_its_start(watched, seed):
+def test_gps_watch_detects_slow_drift_within_fifteen_seconds_of_its_start(make_air, seed):
     """With matches as good as those of a refined map: what they and the receiver have in common cancels out."""
-    air = watched(fix_sd_m=0.7, seed=seed).fly(60)
+    air = make_air(fix_sd_m=0.7, seed=seed).fly(60)
     air.drift_m_s = 1.0
-    assert until_found(air, 0.0) <= 15
+    assert fly_until_alarm(air, 0.0) <= 15

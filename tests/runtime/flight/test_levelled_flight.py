@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
-from flights import STEP_DEG, Flight, of_kind
+from flights import STEP_DEG, Flight, select
 from pictures import textured
-from walks import map_of
+from walks import make_map
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.runtime.flight import watching
@@ -31,7 +31,7 @@ def place_map(tmp_path_factory):
         )
         for place in range(PLACES)
     )
-    return map_of(tmp_path_factory.mktemp("level") / "m.gpkg", technique, frames)
+    return make_map(tmp_path_factory.mktemp("level") / "m.gpkg", technique, frames)
 
 
 def fly(place_map, log, turns, **said):
@@ -47,7 +47,7 @@ def fly(place_map, log, turns, **said):
     images = [np.ascontiguousarray(np.rot90(textured(place + 20, 256, 256), turns)) for place in range(3)]
     source = FakeSource(images, clock, work=lambda: clock.sleep(1.0))
     lines = Flight(place_map, log, clock, link, **{"source.fov_deg": 66.0, "match.reach_m_s": 20.0}).fly(source)
-    return of_kind(lines, "query"), asked_s
+    return select(lines, "query"), asked_s
 
 
 def test_flight_reads_the_attitude_at_the_frame_time(place_map, tmp_path):
@@ -74,16 +74,16 @@ def test_flight_takes_odometry_frames_between_rare_queries_without_gps(place_map
     source = FakeSource([textured(20, 256, 256)] * 11, clock, is_live=is_live)
     flown = Flight(place_map, tmp_path / "f.jsonl", clock, FakeLink(clock, vehicle=vehicle), **FAR_APART)
     lines = flown.fly(source)
-    queries = of_kind(lines, "query")
+    queries = select(lines, "query")
     starts_s = [query["odometry"]["from_s"] - query["t_frame_s"] for query in queries[1:]]
     assert starts_s == [pytest.approx(-before_s, abs=0.25)] * (len(queries) - 1)
     assert len(queries) == (3 if before_s < 10.0 else 11), "the others are no queries"
-    assert not of_kind(lines, "unusable")
+    assert not select(lines, "unusable")
     assert flown.end["queries"] == len(queries)
 
 
 @pytest.fixture
-def surveyed(monkeypatch):
+def fixed_survey(monkeypatch):
     """Nine degrees ahead, and a map that lies 5 m beside GPS: what each survey finds."""
     known, unknown = SurveyMeasure((9.0,), 0.9, 1.5, 1.0), SurveyMeasure((0.0,), 9.0, 1.5, 1.0)
     off_m = SurveyMeasure((3.0, -4.0), 0.5, 1.0, 1.0)
@@ -93,7 +93,7 @@ def surveyed(monkeypatch):
     monkeypatch.setattr(MapSurvey, "compute_result", lambda self: found)
 
 
-@pytest.mark.usefixtures("surveyed")
+@pytest.mark.usefixtures("fixed_survey")
 def test_images_are_levelled_once_the_attitude_is_known(place_map, tmp_path, monkeypatch):
     monkeypatch.setattr(watching, "_SURVEY_INTERVAL", 2)
     monkeypatch.setattr(MapSurvey, "add_match", lambda self, event, distrusts_gps: True)

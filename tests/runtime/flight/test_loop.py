@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 from fakes import FakeSource
-from flights import of_kind
+from flights import select
 from pictures import textured
 
 from edgevpr.core.config import SourceConfig
@@ -33,7 +33,7 @@ def test_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
 
     object.__setattr__(clock.clock, "sleep", sleep)
     lines = flown.fly(FakeSource([PICTURE] * 9, clock))
-    assert len(of_kind(lines, "query")) == 1
+    assert len(select(lines, "query")) == 1
     assert slept == [pytest.approx(0.2)]
 
 
@@ -55,7 +55,7 @@ def test_stop_lets_observers_finish(flight, clock):
     send = flown.link.send
     flown.link.send = lambda *messages: (flown.stop(), send(*messages))
     lines = flown.fly(FakeSource([PICTURE] * 9, clock))
-    assert len(of_kind(lines, "query")) <= 1
+    assert len(select(lines, "query")) <= 1
     stop = Stop()
     with pytest.raises(StopNow), stop.allow_interrupt():
         stop()
@@ -75,10 +75,10 @@ def test_unreadable_frame_is_logged_and_the_next_one_recognised(flight, clock):
     flown = flight()
     pictures = [PICTURE, ImageError("1.png is truncated: copy it again."), PICTURE]
     lines = flown.fly(FakeSource(pictures, clock, is_live=False))
-    assert [line["reason"]["parameters"]["problem"] for line in of_kind(lines, "unusable")] == [
+    assert [line["reason"]["parameters"]["problem"] for line in select(lines, "unusable")] == [
         "1.png is truncated: copy it again."
     ]
-    assert len(of_kind(lines, "query")) == 2
+    assert len(select(lines, "query")) == 2
     assert (flown.end["queries"], flown.end["unusable"]) == (2, 1)
 
 
@@ -131,7 +131,7 @@ def test_recorded_flight_follows_the_times_of_its_images(flight, clock):
 
     steps = iter((0.5, 0.0, 7.0))
     lines = flight().fly(Timed([PICTURE] * 4, clock, is_live=False))
-    taken = [line["t_frame_s"] for line in of_kind(lines, "query")]
+    taken = [line["t_frame_s"] for line in select(lines, "query")]
     assert [each - taken[0] for each in taken] == pytest.approx([0.0, 0.5, 0.5, 7.5])
 
 

@@ -7,13 +7,13 @@ import sqlite3
 from functools import partial
 
 import pytest
-from flights import PLACES, fly_acts, nothing, of_kind
+from flights import PLACES, fly_acts, noop, select
 from map_writer import write_sql
 
 from edgevpr.places.geopackage import encode_point
 from edgevpr.places.mapfile import PlaceMap
 
-SAID = [(4, "edgevpr: map cannot be read, see the log"), (6, "edgevpr: map can be read again")]
+ANNOUNCED = [(4, "edgevpr: map cannot be read, see the log"), (6, "edgevpr: map can be read again")]
 
 
 @pytest.mark.slow
@@ -26,14 +26,12 @@ def test_locked_map_refuses_queries_until_it_is_free(place_map, tmp_path, monkey
 
     maps, opened = [], PlaceMap.open
     monkeypatch.setattr(PlaceMap, "open", lambda path: maps.append(opened(path)) or maps[-1])
-    queries, lines, flight = fly_acts(
-        place_map, tmp_path / "log", [look, lock, *[nothing] * 8, other.close, look, look]
-    )
+    queries, lines, flight = fly_acts(place_map, tmp_path / "log", [look, lock, *[noop] * 8, other.close, look, look])
     assert waits_ms == [50, 50, 50], "no query waits for longer, also when the file has been opened anew"
     assert [line["accepted"] for line in queries] == [True, *[False] * 9, True, True, True]
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:10])
-    assert flight.link.texts() == SAID
-    assert [line["note"]["code"] for line in of_kind(lines, "map")] == ["MAP_LOST", "MAP_BACK"]
+    assert flight.link.texts() == ANNOUNCED
+    assert [line["note"]["code"] for line in select(lines, "map")] == ["MAP_LOST", "MAP_BACK"]
     assert flight.end["left_out"] == 0
 
 
@@ -64,10 +62,10 @@ def test_missing_map_refuses_queries_until_it_is_back(recording, tmp_path, techn
             place_map.unlink()
         place_map.write_bytes(whole)
 
-    queries, _, flight = fly_acts(place_map, tmp_path / "log", [nothing, lose, nothing, nothing, restore, nothing])
+    queries, _, flight = fly_acts(place_map, tmp_path / "log", [noop, lose, noop, noop, restore, noop])
     assert [line["accepted"] for line in queries] == [True, False, False, False, True, True], queries[-1]["reason"]
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:4])
-    assert flight.link.texts() == SAID
+    assert flight.link.texts() == ANNOUNCED
     assert flight.end["left_out"] == 0, "no place is lost for good with the file"
 
 
@@ -88,8 +86,8 @@ def test_replaced_map_is_refused_and_reported_once(recording, tmp_path, techniqu
         else:
             other.rename(place_map)
 
-    queries, _, flight = fly_acts(place_map, tmp_path / "log", [nothing, replace, *[nothing] * 4])
+    queries, _, flight = fly_acts(place_map, tmp_path / "log", [noop, replace, *[noop] * 4])
     assert [line["accepted"] for line in queries] == [True, *[False] * 5]
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:])
-    assert flight.link.texts() == SAID[:1]
+    assert flight.link.texts() == ANNOUNCED[:1]
     assert len([each for each in caplog.records if "another map" in each.message]) == 1

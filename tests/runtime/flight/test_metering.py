@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 from fakes import FakeSource
-from flights import flight_meter, of_kind
+from flights import flight_meter, select
 from pictures import textured
 
 from edgevpr.power.thermal import ThermalState
@@ -42,7 +42,7 @@ def test_used_mah_of_a_flight_equals_the_closed_form(make_flight, clock):
     assert totals["used_mah"] == pytest.approx(mah * (2.29 * elapsed_s + busy_j), rel=1e-6)
     assert totals["marginal_mah"] == pytest.approx(mah * busy_j, rel=1e-6), "nothing else was done"
     # The queries' own charge is idle power while they last and what they add; reading the picture stands beside it.
-    queries = of_kind(lines, "query")
+    queries = select(lines, "query")
     assert len(queries) == 150
     in_queries_mah = sum(line["costs"]["marginal_mah"] for line in queries)
     reading_mah = mah * 4.53 / 4 * sum(line["reading"]["cpu_s"] for line in queries)
@@ -58,7 +58,7 @@ def test_heat_is_logged_and_announced_and_figures_of_a_throttled_board_are_marke
     watch = SimpleNamespace(read=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
     meter = flight_meter(flight, machine=Machine(flight.board, watch))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
-    boards = [line["board"] for line in of_kind(lines, "query")]
+    boards = [line["board"] for line in select(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))
     told = [each.temperature_core[0] for each in link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
     assert told[0] == 61

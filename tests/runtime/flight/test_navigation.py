@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, STEP_S, Air, lengths
+from air import HOME, STEP_S, SimFlight, norms
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import offset_m, offset_position
@@ -18,13 +18,13 @@ from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
 
 
-def match_at(position, t_s, fix_sd_m, attitude_error=None, **frame):
+def make_fix(position, t_s, fix_sd_m, attitude_error=None, **frame):
     frame = FrameMeasurement(t_s=t_s, **{"sd_m": 0.0} | frame)
     match = {"covariance_m2": fix_sd_m**2 * np.eye(2), "places": (1,), "attitude_error": attitude_error}
     return PositionedMatch(frame=frame, position=position, accuracy_m=fix_sd_m, **match)
 
 
-class Flown(Air):
+class NavigatedFlight(SimFlight):
     """A flight that has lost GPS after `gps_s`. Its matches all correct its navigation, as `look` makes them of the
     time of a frame and of where it was taken (2,); nothing is sent."""
 
@@ -48,7 +48,7 @@ class Flown(Air):
             return
         seen_m, more = self.look(step * STEP_S, self.way[step] + self.rng.normal(0, self.fix_sd_m, 2))
         at = Position(*offset_position(*HOME, *seen_m))
-        seen = match_at(at, step * STEP_S, **{"fix_sd_m": self.fix_sd_m} | more)
+        seen = make_fix(at, step * STEP_S, **{"fix_sd_m": self.fix_sd_m} | more)
         self.navigation.correct_by_fix(self.navigation.predict_fix(seen))
 
     def errors(self, from_s):
@@ -59,7 +59,7 @@ class Flown(Air):
 
 
 def test_navigation_attitude_error_in_images_moves_no_fix_of_a_dead_reckoning_autopilot():
-    flown, wrong = Flown(10, fix_sd_m=0.5), np.array([0.06, 0.0])  # of the height: 3.4 degrees
+    flown, wrong = NavigatedFlight(10, fix_sd_m=0.5), np.array([0.06, 0.0])  # of the height: 3.4 degrees
 
     def look(t_s, seen_m):
         shown = AttitudeError(tuple(flown.rng.normal(wrong, 0.02)), 0.02)
@@ -68,7 +68,7 @@ def test_navigation_attitude_error_in_images_moves_no_fix_of_a_dead_reckoning_au
     flown.look = look
     flown.fly(120)
     errors_m, said_m = flown.errors(10)
-    assert np.median(lengths(errors_m[200:])) < 1.5
+    assert np.median(norms(errors_m[200:])) < 1.5
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
@@ -76,7 +76,7 @@ def test_navigation_attitude_error_in_images_moves_no_fix_of_a_dead_reckoning_au
 def test_navigation_allows_for_attitude_errors_after_a_new_wind(upset, monkeypatch):
     """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
     monkeypatch.setattr(drift, "_GPS_LOSS_NOISE_FACTOR", upset)
-    flown, frames = Flown(30, wind=(5.0, 0.0), fix_sd_m=0.5), []
+    flown, frames = NavigatedFlight(30, wind=(5.0, 0.0), fix_sd_m=0.5), []
 
     def look(t_s, seen_m):
         seen_m[0] += 8.0 * np.clip((t_s - 30) / 10, 0, 1)
@@ -94,15 +94,15 @@ def test_navigation_allows_for_attitude_errors_after_a_new_wind(upset, monkeypat
 
 
 def test_navigation_without_tilt_measurements_does_not_learn_attitude_from_fixes():
-    flown = Flown(10, wind=(5.0, 0.0), fix_sd_m=2.0)
+    flown = NavigatedFlight(10, wind=(5.0, 0.0), fix_sd_m=2.0)
     flown.look = lambda t_s, seen_m: (seen_m, {"attitude_gain_s2": 18.0})
     errors_m, said_m = flown.fly(460).errors(70)
-    assert np.median(lengths(errors_m)) < 2.5
+    assert np.median(norms(errors_m)) < 2.5
     assert said_m.max() < 4.0, "and does not grow"
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
-class Received:
+class ReceiverOnly:
     """A path of accelerations that stands still, beside a receiver that is `off_m` east of HOME and an estimate of the
     autopilot that is elsewhere, since it is made of our own positions."""
 
@@ -129,21 +129,21 @@ class Received:
 
 
 def test_navigation_by_accelerations_uses_the_receiver_and_never_the_estimate():
-    flown = Received().fly(20)
+    flown = ReceiverOnly().fly(20)
     assert flown.east_m == pytest.approx(0.0, abs=0.5)
     assert flown.navigation.has_gps
-    assert Received().fly(5, has_gps=False).navigation.estimate_state(5.0) is None, "its estimate may be ours"
+    assert ReceiverOnly().fly(5, has_gps=False).navigation.estimate_state(5.0) is None, "its estimate may be ours"
 
 
 def test_navigation_allows_for_the_lag_of_a_receiver():
-    flown = Received()
+    flown = ReceiverOnly()
     for number in range(100):
         flown.fly(0.1, off_m=2.0 * number, velocity_m_s=(20.0, 0.0))
     assert flown.east_m == pytest.approx(2.0 * 99, abs=1.5)
 
 
 def test_steady_receiver_overrules_our_position_after_two_seconds():
-    flown = Received().fly(20)
+    flown = ReceiverOnly().fly(20)
     flown.steady_since_s = flown.t_s
     flown.fly(1, off_m=150.0)
     assert flown.navigation.is_in_doubt
@@ -156,10 +156,10 @@ def test_steady_receiver_overrules_our_position_after_two_seconds():
 
 
 def test_contradicting_receiver_does_not_overrule_recent_matches():
-    flown = Received().fly(20)
+    flown = ReceiverOnly().fly(20)
     for _ in range(5):
         flown.fly(1, off_m=150.0)
-        fix = flown.navigation.predict_fix(match_at(Position(*HOME), flown.t_s, 1.0))
+        fix = flown.navigation.predict_fix(make_fix(Position(*HOME), flown.t_s, 1.0))
         flown.navigation.correct_by_fix(fix)
     assert not flown.navigation.has_gps
     assert not flown.navigation.is_in_doubt
@@ -171,7 +171,7 @@ def test_contradicting_receiver_does_not_overrule_recent_matches():
 )
 def test_odometry_claims_the_error_of_unknown_terrain(zoom, gap_s, least_m, most_m):
     """A hundred metres without a match: over ground that seems flat, that falls away, and after a gap."""
-    flown = Received().fly(10)
+    flown = ReceiverOnly().fly(10)
     flown.fly(gap_s, has_gps=False)
     for number in range(10):
         flown.fly(1, has_gps=False)
@@ -186,9 +186,9 @@ def test_odometry_claims_the_error_of_unknown_terrain(zoom, gap_s, least_m, most
 
 
 def test_navigation_by_accelerations_alone_starts_at_a_fix():
-    flown = Flown(0, INERTIAL, fix_sd_m=2.0)
+    flown = NavigatedFlight(0, INERTIAL, fix_sd_m=2.0)
     assert flown.navigation.estimate_state(0.0) is None
     flown.navigation.start_at_fix(Position(*HOME), 3.0, -1.0, 0.0)
     assert flown.navigation.estimate_state(0.0).accuracy_m > 10, "nobody knows how fast it was"
     errors_m, _ = flown.fly(60).errors(40)
-    assert lengths(errors_m).max() < 6.0
+    assert norms(errors_m).max() < 6.0

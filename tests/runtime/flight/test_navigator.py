@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from air import HOME, Air, lengths, match_at
+from air import HOME, SimFlight, make_match, norms
 from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m
@@ -19,30 +19,30 @@ from edgevpr.runtime.recognise.perspective import AttitudeError
 pytestmark = pytest.mark.slow
 
 WIND = 6.0, 0.0
-LIKE_ONE = math.sqrt(50)  # by so much more a continuous position says that it is wrong
+INFLATION = math.sqrt(50)  # by so much more a continuous position says that it is wrong
 
 
-def lost(navigator=None, **how):
+def lose_gps(navigator=None, **how):
     """A flight that has just lost GPS."""
-    air = Air(navigator or Navigator(1.0, how.get("every_s", 1.0)), **how)
+    air = SimFlight(navigator or Navigator(1.0, how.get("every_s", 1.0)), **how)
     air.fly(30)
     air.lose_gps()
     air.errors_m.clear()
     return air
 
 
-def inertial(navigator):
+def use_gps_input(navigator):
     navigator.handle_channel(Channel.GPS_INPUT)
     return navigator
 
 
-def said_states(air, from_s=0.0):
+def sent_states(air, from_s=0.0):
     return [(t_s, state) for t_s, state in air.states if state and t_s >= from_s]
 
 
 @pytest.mark.parametrize("begins_anew", [False, True])
 def test_fixes_with_a_new_error_are_accepted_after_a_reset(begins_anew):
-    air = Air(Navigator(1.0, 1.0))
+    air = SimFlight(Navigator(1.0, 1.0))
     air.map_off = air.map_off + np.array((16.0, 0.0))
     air.fly(120)
     air.map_off = air.map_off - np.array((16.0, 0.0))
@@ -56,10 +56,10 @@ def test_fixes_with_a_new_error_are_accepted_after_a_reset(begins_anew):
 
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0])
 def test_navigator_keeps_an_autopilot_that_uses_its_fixes_within_metres_in_wind(fix_sd_m):
-    air, alone = lost(wind=WIND, fix_sd_m=fix_sd_m), lost(wind=WIND)
+    air, alone = lose_gps(wind=WIND, fix_sd_m=fix_sd_m), lose_gps(wind=WIND)
     alone.takes_fixes = False
-    errors_m = lengths(air.fly(300).errors_m)
-    assert lengths(alone.fly(300).errors_m).max() > 1500
+    errors_m = norms(air.fly(300).errors_m)
+    assert norms(alone.fly(300).errors_m).max() > 1500
     assert np.median(errors_m) < 2 + fix_sd_m
     assert errors_m.max() < 10 + 3 * fix_sd_m
 
@@ -68,11 +68,11 @@ def test_navigator_keeps_an_autopilot_that_uses_its_fixes_within_metres_in_wind(
 @pytest.mark.parametrize("speed_m_s", [15.0, 7.0])
 def test_navigator_never_worsens_good_dead_reckoning(speed_m_s, seed):
     """With matches as good as those over a refined map with ArduPilot in its simulator."""
-    air = lost(speed_m_s=speed_m_s, fix_sd_m=0.6, said_sd_m=1.1, other_sd_m=0.0, seed=seed).fly(300)
-    assert lengths(air.errors_m).max() < 3.0, "and alone it is exact"
+    air = lose_gps(speed_m_s=speed_m_s, fix_sd_m=0.6, said_sd_m=1.1, other_sd_m=0.0, seed=seed).fly(300)
+    assert norms(air.errors_m).max() < 3.0, "and alone it is exact"
 
 
-HOWS = [
+FLIGHT_SETTINGS = [
     {"gusts": 0.3},
     {"wind": WIND, "gusts": 0.5},
     {"wind": WIND, "gusts": 0.5, "fix_sd_m": 8.0},
@@ -80,11 +80,11 @@ HOWS = [
 ]
 
 
-@pytest.mark.parametrize("how", HOWS)
+@pytest.mark.parametrize("how", FLIGHT_SETTINGS)
 def test_navigator_claims_match_its_errors(how):
     known = []
     for seed in range(3):
-        air = lost(seed=seed, **how).fly(10)
+        air = lose_gps(seed=seed, **how).fly(10)
         for _ in range(200):
             air.fly(1)
             here = air.navigator._navigation.estimate_state(air.t_s)
@@ -97,29 +97,29 @@ def test_navigator_claims_match_its_errors(how):
 def test_navigator_sends_positions_to_px4_only_without_gps(channel):
     navigator = Navigator(1.0, 1.0)
     navigator.handle_channel(channel)
-    air = Air(navigator, wind=WIND).fly(30)
-    assert not said_states(air)
+    air = SimFlight(navigator, wind=WIND).fly(30)
+    assert not sent_states(air)
     air.lose_gps()
     air.fly(150)
-    said = said_states(air, from_s=32.0)
+    said = sent_states(air, from_s=32.0)
     assert len(said) > 0.99 * 10 * 148
     off_m = np.array([air.off(state.lat_deg, state.lon_deg, t_s) for t_s, state in said])
     claimed_m = np.array([state.accuracy_m for _, state in said])
-    assert lengths(off_m).max() < 10.0, "of matches that are 3 m off"
+    assert norms(off_m).max() < 10.0, "of matches that are 3 m off"
     assert (abs(off_m) < claimed_m[:, None]).mean() > 0.58
     assert (abs(off_m) < 2 * claimed_m[:, None]).mean() > 0.92
 
 
 def test_navigator_claims_larger_errors_without_attitude():
     """At 100 m a tilt of 15 degrees is 27 m."""
-    level, untold = lost(wind=WIND, fix_sd_m=1.0), lost(wind=WIND, fix_sd_m=1.0, attitude=(None, None))
+    level, untold = lose_gps(wind=WIND, fix_sd_m=1.0), lose_gps(wind=WIND, fix_sd_m=1.0, attitude=(None, None))
     told, less = (air.fly(20).sent[-1][1].accuracy_m for air in (level, untold))
     assert told < 5
     assert less > 10
 
 
 def test_navigator_sends_nothing_during_a_link_outage_and_resumes_after_it():
-    air = lost(wind=WIND).fly(60)
+    air = lose_gps(wind=WIND).fly(60)
     air.is_silent = True
     air.fly(5)
     assert not air.navigator.knows_position(air.t_s)
@@ -127,11 +127,11 @@ def test_navigator_sends_nothing_during_a_link_outage_and_resumes_after_it():
     air.errors_m.clear()
     air.fly(60)
     assert max(air.sent[-1][0], air.between[-1][0].t_frame_s) > air.t_s - 5
-    assert lengths(air.errors_m)[10:].max() < 20
+    assert norms(air.errors_m)[10:].max() < 20
 
 
 def test_navigator_sends_matches_to_a_restarted_autopilot_and_resumes_with_its_reports():
-    air = lost(wind=WIND).fly(60)
+    air = lose_gps(wind=WIND).fly(60)
     air.knows_nothing = True
     air.off_m = np.array([-400.0, 900.0])  # where it began
     air.fly(3)
@@ -143,16 +143,16 @@ def test_navigator_sends_matches_to_a_restarted_autopilot_and_resumes_with_its_r
     assert any(advice.is_held for _, advice in air.advices[-10:]), "one alone is not believed against it"
     air.errors_m.clear()
     air.fly(30)
-    assert lengths(air.errors_m).max() < 15
+    assert norms(air.errors_m).max() < 15
 
 
 def test_navigator_streams_ten_smooth_positions_a_second():
-    air = lost(inertial(Navigator(1.0, 1.0)))
+    air = lose_gps(use_gps_input(Navigator(1.0, 1.0)))
     air.fly(20)
     moved_s = air.t_s
     air.map_off = np.array([25.0, 0.0])  # two in a row are believed
     air.fly(30)
-    states = said_states(air, moved_s - 5)
+    states = sent_states(air, moved_s - 5)
     steps_s = np.diff([t_s for t_s, _ in states])
     assert steps_s == pytest.approx(0.1)
     beyond_m = []
@@ -161,21 +161,21 @@ def test_navigator_streams_ten_smooth_positions_a_second():
         carried = navigator.offset_position(one.lat_deg, one.lon_deg, east_m, north_m)
         beyond_m.append(float(distance_m(*carried, other.lat_deg, other.lon_deg)))
     assert max(beyond_m) < 0.5
-    accuracies_m = [state.accuracy_m / LIKE_ONE for _, state in states]
+    accuracies_m = [state.accuracy_m / INFLATION for _, state in states]
     assert max(accuracies_m) > 10, "while it lies behind it says so"
     last = states[-1][1]
     assert air.off(last.lat_deg, last.lon_deg) == pytest.approx((25.0, 0.0), abs=6.0), "it has followed"
-    assert last.accuracy_m / LIKE_ONE < 4
+    assert last.accuracy_m / INFLATION < 4
 
 
 def test_navigator_stream_stays_accurate_and_reports_its_accuracy():
-    air = lost(inertial(Navigator(1.0, 1.0)), bias=(0.05, -0.03), fix_sd_m=2.0).fly(200)
-    states = said_states(air, 40)
+    air = lose_gps(use_gps_input(Navigator(1.0, 1.0)), bias=(0.05, -0.03), fix_sd_m=2.0).fly(200)
+    states = sent_states(air, 40)
     assert len(states) == pytest.approx(1900, abs=3)
     off_m = np.array([air.off(state.lat_deg, state.lon_deg, t_s) for t_s, state in states])
-    said_m = np.array([state.accuracy_m for _, state in states]) / LIKE_ONE
-    assert np.median(lengths(off_m)) < 2.5
-    assert lengths(off_m).max() < 8
+    said_m = np.array([state.accuracy_m for _, state in states]) / INFLATION
+    assert np.median(norms(off_m)) < 2.5
+    assert norms(off_m).max() < 8
     assert 0.58 <= (abs(off_m) < said_m[:, None]).mean() <= 0.85
     last = states[-1][1]
     assert last.alt_m == 300.0
@@ -185,16 +185,16 @@ def test_navigator_stream_stays_accurate_and_reports_its_accuracy():
 
 def test_navigator_sends_the_observed_drift_between_matches():
     how = {"wind": WIND, "every_s": 10.0}
-    air, other = lost(**how), lost(**how)
+    air, other = lose_gps(**how), lose_gps(**how)
     other.navigator.make_interim_fix = lambda now_s: None
-    errors_m, others_m = (lengths(each.fly(300).errors_m)[60:] for each in (air, other))
+    errors_m, others_m = (norms(each.fly(300).errors_m)[60:] for each in (air, other))
     assert np.median(errors_m) < 12
     assert errors_m.max() < 45
     assert np.median(errors_m) < 0.4 * np.median(others_m)
 
 
 def test_navigator_claims_match_its_errors_between_matches():
-    runs = [lost(wind=WIND, gusts=0.3, every_s=10.0, seed=seed).fly(300) for seed in range(3)]
+    runs = [lose_gps(wind=WIND, gusts=0.3, every_s=10.0, seed=seed).fly(300) for seed in range(3)]
     sigmas = np.concatenate([off_m / fix.accuracy_m for run in runs for fix, off_m in run.between])
     assert len(sigmas) > 300
     assert 0.58 <= (abs(sigmas) < 1).mean() <= 0.85
@@ -211,7 +211,7 @@ def test_report_accuracy_contains_the_attitude_error_that_images_show(shown_sd, 
         vehicle = vehicle_at(*HOME, t_s, has_gps=False, position_sd_m=30.0, **attitude)
         navigator.handle_vehicle(vehicle)
         shown = AttitudeError(tuple(rng.normal(0.0, shown_sd, 2)), 0.024)
-        event = match_at(Position(*HOME), t_s, vehicle, 1.0, (1,), View(nadir_offset=(0.01, 0.0)), shown)
+        event = make_match(Position(*HOME), t_s, vehicle, 1.0, (1,), View(nadir_offset=(0.01, 0.0)), shown)
         navigator.advise(event, t_s)
     reported = navigator.report_accuracy(event)
     assert reported.accuracy_m == pytest.approx(math.hypot(1.0, height_m * attitude_sd), rel=0.25)

@@ -12,11 +12,11 @@ from edgevpr.runtime.flight.output import Output, OutputWatch
 
 HOME = 50.0, 8.0
 BEGIN_S = 1000.0
-AWAY = {"off_m": 15.1}
-REFUSES = {"ratio": 1.01, "has_gps": False}
+OFF_RECEIVER = {"off_m": 15.1}
+REFUSING = {"ratio": 1.01, "has_gps": False}
 
 
-def withdrawn(*reports):
+def list_withdrawn(*reports):
     """What is withdrawn after reports: so many seconds after the first, how far the estimate is from its receiver, the
     ratio of its innovation, and how long ago a position was sent and a match was believed."""
     watch = OutputWatch()
@@ -35,33 +35,33 @@ def withdrawn(*reports):
 @pytest.mark.parametrize(
     ("last_s", "known", "output"),
     [
-        (2.0, AWAY, Output.LEADS_AWAY),
-        (1.9, AWAY, None),
+        (2.0, OFF_RECEIVER, Output.LEADS_AWAY),
+        (1.9, OFF_RECEIVER, None),
         (2.0, {"off_m": 14.9}, None),
         (2.0, {"off_m": 20.1, "sd_m": 5.0}, Output.LEADS_AWAY),
         (2.0, {"off_m": 19.9, "sd_m": 5.0}, None),
-        (2.0, AWAY | {"steady_s": 3.0}, Output.LEADS_AWAY),
-        (2.0, AWAY | {"steady_s": 2.9}, None),
-        (2.0, AWAY | {"sent_ago_s": 10.0}, Output.LEADS_AWAY),
-        (2.0, AWAY | {"sent_ago_s": 10.1}, None),
-        (2.0, AWAY | {"sent_ago_s": math.inf}, None),
-        (2.0, AWAY | {"fixed_ago_s": 5.0}, None),
-        (2.0, AWAY | {"fixed_ago_s": 5.1}, Output.LEADS_AWAY),
-        (2.0, AWAY | {"has_gps": False}, None),
-        (3.0, REFUSES, Output.REFUSED),
-        (2.9, REFUSES, None),
-        (3.0, REFUSES | {"ratio": 1.0}, None),
-        (3.0, REFUSES | {"ratio": None}, None),
-        (3.0, REFUSES | {"has_gps": True}, None),
-        (3.0, REFUSES | {"sent_ago_s": 1.0}, Output.REFUSED),
-        (3.0, REFUSES | {"sent_ago_s": 1.1}, None),
-        (3.0, REFUSES | {"fixed_ago_s": 5.0}, None),
-        (3.0, REFUSES | {"fixed_ago_s": 5.1}, Output.REFUSED),
+        (2.0, OFF_RECEIVER | {"steady_s": 3.0}, Output.LEADS_AWAY),
+        (2.0, OFF_RECEIVER | {"steady_s": 2.9}, None),
+        (2.0, OFF_RECEIVER | {"sent_ago_s": 10.0}, Output.LEADS_AWAY),
+        (2.0, OFF_RECEIVER | {"sent_ago_s": 10.1}, None),
+        (2.0, OFF_RECEIVER | {"sent_ago_s": math.inf}, None),
+        (2.0, OFF_RECEIVER | {"fixed_ago_s": 5.0}, None),
+        (2.0, OFF_RECEIVER | {"fixed_ago_s": 5.1}, Output.LEADS_AWAY),
+        (2.0, OFF_RECEIVER | {"has_gps": False}, None),
+        (3.0, REFUSING, Output.REFUSED),
+        (2.9, REFUSING, None),
+        (3.0, REFUSING | {"ratio": 1.0}, None),
+        (3.0, REFUSING | {"ratio": None}, None),
+        (3.0, REFUSING | {"has_gps": True}, None),
+        (3.0, REFUSING | {"sent_ago_s": 1.0}, Output.REFUSED),
+        (3.0, REFUSING | {"sent_ago_s": 1.1}, None),
+        (3.0, REFUSING | {"fixed_ago_s": 5.0}, None),
+        (3.0, REFUSING | {"fixed_ago_s": 5.1}, Output.REFUSED),
     ],
 )
 def test_output_withdraws_positions_that_mislead_or_are_refused(last_s, known, output):
-    assert withdrawn((0.0, known), (1.0, known), (last_s, known)) is output
-    assert withdrawn((0.0, known), (1.0, {}), (last_s, known)) is None, "not all the time"
+    assert list_withdrawn((0.0, known), (1.0, known), (last_s, known)) is output
+    assert list_withdrawn((0.0, known), (1.0, {}), (last_s, known)) is None, "not all the time"
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_output_withdraws_positions_that_mislead_or_are_refused(last_s, known, o
     ],
 )
 def test_positions_are_withdrawn_until_a_match_or_gps_proves_them(known, output):
-    led_away = (0.0, AWAY), (2.0, AWAY)
-    assert withdrawn(*led_away, (12.0, known)) is output
+    led_away = (0.0, OFF_RECEIVER), (2.0, OFF_RECEIVER)
+    assert list_withdrawn(*led_away, (12.0, known)) is output
     back = {"has_gps": True} | known
-    assert withdrawn(*led_away, (12.1, back)) is (None if back["has_gps"] else output)
-    assert withdrawn(*led_away, (11.5, AWAY), (12.1, AWAY)) is Output.LEADS_AWAY
+    assert list_withdrawn(*led_away, (12.1, back)) is (None if back["has_gps"] else output)
+    assert list_withdrawn(*led_away, (11.5, OFF_RECEIVER), (12.1, OFF_RECEIVER)) is Output.LEADS_AWAY
 
 
 @pytest.mark.parametrize("output", Output)

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 from fakes import FakeClock, FakeSource
-from full_disk import no_file_larger_than
+from full_disk import limit_file_size
 from loopback import wait_until
 from pictures import textured
 
@@ -92,7 +92,7 @@ def test_recording_ends_on_a_full_disk_without_ending_the_flight(tmp_path):
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
         wait_until(lambda: not tape._queue)
-        with no_file_larger_than(5000):
+        with limit_file_size(5000):
             tape.store_frame(bytes(9000))
             tape.note("frame")
             wait_until(lambda: tape.state)

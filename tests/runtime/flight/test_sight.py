@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fakes import FakeSource
-from flights import of_kind, pictures
+from flights import pictures, select
 
 from edgevpr.core.config import load_config
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -15,7 +15,7 @@ from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.watching import MapCoverageWatch
 
 
-class Seen:
+class SightFlight:
     """A sight with its listeners; `look` shows it pictures, one a second."""
 
     def __init__(self, notifier, clock, link):
@@ -42,21 +42,21 @@ class Seen:
 
 
 @pytest.fixture
-def seen(notifier, clock, link):
-    return Seen(notifier, clock, link)
+def sight_flight(notifier, clock, link):
+    return SightFlight(notifier, clock, link)
 
 
-def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_matches(seen, tmp_path):
-    assert seen.look("+++" + "-" * 29) == []
-    assert seen.look("-") == ["aircraft has left the map"]
-    assert seen.look("-" * 50) == ["aircraft has left the map"]
-    assert seen.look("+--") == ["aircraft has left the map"]
-    assert seen.look("+") == ["aircraft has left the map", "aircraft is back on the map"]
+def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_matches(sight_flight, tmp_path):
+    assert sight_flight.look("+++" + "-" * 29) == []
+    assert sight_flight.look("-") == ["aircraft has left the map"]
+    assert sight_flight.look("-" * 50) == ["aircraft has left the map"]
+    assert sight_flight.look("+--") == ["aircraft has left the map"]
+    assert sight_flight.look("+") == ["aircraft has left the map", "aircraft is back on the map"]
     assert [(line["kind"], line["note"]["code"]) for line in read_log(tmp_path / "log")] == [
         ("sight", "MAP_LEFT"),
         ("sight", "MAP_FOUND"),
     ]
-    assert [severity for severity, _ in seen.link.texts()] == [4, 6]
+    assert [severity for severity, _ in sight_flight.link.texts()] == [4, 6]
 
 
 @pytest.mark.parametrize(
@@ -68,21 +68,21 @@ def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_mat
         ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, ["aircraft has left the map"]),  # matches far apart
     ],
 )
-def test_sight_requires_several_queries_to_leave_or_find_the_map(seen, outcomes, texts):
-    assert seen.look(outcomes) == texts
+def test_sight_requires_several_queries_to_leave_or_find_the_map(sight_flight, outcomes, texts):
+    assert sight_flight.look(outcomes) == texts
 
 
 @pytest.mark.parametrize("outcome", "0xtnu")
-def test_sight_ignores_queries_without_information_about_the_map(seen, outcome):
-    assert "aircraft has left the map" not in seen.look("+++" + "-" * 29 + outcome * 40)
-    assert seen.look("-")[-1] == "aircraft has left the map"
+def test_sight_ignores_queries_without_information_about_the_map(sight_flight, outcome):
+    assert "aircraft has left the map" not in sight_flight.look("+++" + "-" * 29 + outcome * 40)
+    assert sight_flight.look("-")[-1] == "aircraft has left the map"
 
 
-def test_sight_reports_tilt_after_five_seconds_and_its_end(seen, tmp_path):
-    assert seen.look("-" + "t" * 5) == []
-    assert seen.look("t") == ["tilt too large"]
-    assert seen.look("-----") == ["tilt too large"]
-    assert seen.look("-") == ["tilt too large", "tilt is acceptable again"]
+def test_sight_reports_tilt_after_five_seconds_and_its_end(sight_flight, tmp_path):
+    assert sight_flight.look("-" + "t" * 5) == []
+    assert sight_flight.look("t") == ["tilt too large"]
+    assert sight_flight.look("-----") == ["tilt too large"]
+    assert sight_flight.look("-") == ["tilt too large", "tilt is acceptable again"]
     assert [line["kind"] for line in read_log(tmp_path / "log")] == ["tilt", "tilt"]
 
 
@@ -90,7 +90,7 @@ def test_sight_reports_tilt_after_five_seconds_and_its_end(seen, tmp_path):
 def test_sight_reports_a_flight_that_leaves_its_map_and_returns(make_flight, clock, link):
     lines = make_flight().fly(FakeSource([*pictures(8), *pictures(40, first=100), *pictures(8)], clock))
     assert link.texts() == [(4, "edgevpr: aircraft has left the map"), (6, "edgevpr: aircraft is back on the map")]
-    assert [line["note"]["code"] for line in of_kind(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
+    assert [line["note"]["code"] for line in select(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
 
 
 @pytest.mark.parametrize(
@@ -122,9 +122,9 @@ def test_sight_reports_images_rotated_from_the_heading_once(notifier, link, rota
 def test_mirrored_images_are_reported_once_and_only_if_none_matches(make_flight, clock, link, axis):
     mirrored = [np.flip(picture, axis).copy() for picture in pictures(8)]
     lines = make_flight().fly(FakeSource([*mirrored, *mirrored, *mirrored[:4]], clock))
-    assert not any(line["accepted"] for line in of_kind(lines, "query"))
+    assert not any(line["accepted"] for line in select(lines, "query"))
     assert link.texts() == [(4, "edgevpr: images are mirrored")]
-    (line,) = of_kind(lines, "camera")
+    (line,) = select(lines, "camera")
     assert line["note"]["code"] == "IMAGES_MIRRORED"
 
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from air import Air
+from air import SimFlight
 from fakes import FakeClock, FakeLink, to_autopilot
 
 from edgevpr.core.config import SourceSetsConfig
@@ -15,13 +15,13 @@ from edgevpr.runtime.flight.navigator import Navigator
 
 pytestmark = pytest.mark.slow
 
-NEVER = -math.inf
+NEVER_S = -math.inf
 SETS = {"source_sets.gps": 1, "source_sets.no_gps": 2}
-ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
+BOTH_SETS = SourceSetsConfig(gps=1, no_gps=2)
 LOAD = MachineLoad((0.5,), 1, 2)
 
 
-class Flown(Air):
+class AnsweringFlight(SimFlight):
     """A flight whose autopilot answers at once to what it is asked; `asked` are the times and numbers."""
 
     def __init__(self, **settings):
@@ -54,7 +54,7 @@ class Flown(Air):
 
 
 def test_source_sets_request_the_set_without_gps_once_and_the_other_after_ten_seconds_of_gps():
-    flown = Flown(**SETS).fly(5)
+    flown = AnsweringFlight(**SETS).fly(5)
     assert flown.numbers == []
     lost_s = flown.t_s
     flown.lose_gps()
@@ -67,7 +67,7 @@ def test_source_sets_request_the_set_without_gps_once_and_the_other_after_ten_se
 
 
 def test_source_sets_treat_a_wrong_receiver_as_none():
-    flown = Flown(**SETS)
+    flown = AnsweringFlight(**SETS)
     flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=True)
     assert flown.fly(3).numbers == [2]
     flown.autopilot.compare_gps(3.0, is_wrong=False, have_agreed=True)
@@ -75,7 +75,7 @@ def test_source_sets_treat_a_wrong_receiver_as_none():
 
 
 def test_source_sets_keep_a_receiver_that_never_agreed_with_the_map():
-    flown = Flown(**SETS)
+    flown = AnsweringFlight(**SETS)
     flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=False)
     assert flown.fly(3).numbers == []
 
@@ -84,22 +84,22 @@ def test_source_sets_keep_a_receiver_that_never_agreed_with_the_map():
     "settings", [{}, {"source_sets.gps": 1}, {"source_sets.no_gps": 2}, SETS | {"send_fixes": False}]
 )
 def test_source_sets_request_nothing_without_both_sets_or_in_a_dry_run(settings):
-    flown = Flown(**settings)
+    flown = AnsweringFlight(**settings)
     flown.lose_gps()
     flown.fly(20).find_gps()
     assert flown.fly(20).numbers == []
 
 
 def test_source_sets_repeat_an_unanswered_request():
-    sets = SourceSets(ALLOWED)
-    asked = [sets.choose_set(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER) for t_s in range(30)]
+    sets = SourceSets(BOTH_SETS)
+    asked = [sets.choose_set(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER_S) for t_s in range(30)]
     assert [t_s / 2 for t_s, number in enumerate(asked) if number == 2] == [0, 2, 4]
     assert sets.choose_set(40.0, True, True, answered_s=5.1) == 1, "GPS is good"
     assert sets.choose_set(43.0, True, True, answered_s=5.1) == 1, "that answer was for the other one"
 
 
 def test_source_sets_request_nothing_without_a_position_of_ours():
-    sets = SourceSets(ALLOWED)
-    assert sets.choose_set(0.0, has_gps=False, has_own=False, answered_s=NEVER) is None
-    assert sets.choose_set(1.0, has_gps=False, has_own=True, answered_s=NEVER) == 2
+    sets = SourceSets(BOTH_SETS)
+    assert sets.choose_set(0.0, has_gps=False, has_own=False, answered_s=NEVER_S) is None
+    assert sets.choose_set(1.0, has_gps=False, has_own=True, answered_s=NEVER_S) == 2
     assert sets.choose_set(2.0, has_gps=False, has_own=True, answered_s=1.1) is None

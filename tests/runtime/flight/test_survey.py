@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from air import HOME, match_at
+from air import HOME, make_match
 from fakes import FakeClock, FakeLink, receiver_at, vehicle_at
 
 from edgevpr.core.config import load_config
@@ -28,8 +28,8 @@ HEIGHT_M = 100.0
 SPEED_M_S = 15.0
 FIX_SD_M = 2.0
 GPS_SD_M = 1.0
-GPS_LASTS_S = 60.0
-SEEN = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0))
+GPS_TAU_S = 60.0
+VIEW = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0))
 
 
 def circle(t_s):
@@ -57,14 +57,14 @@ def line(t_s):
     return np.array([0.0, SPEED_M_S * t_s]), 0.0
 
 
-def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said):
+def make_matches(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said):
     """The matches of a flight, one a second, with a GPS whose error lasts; `wrong` is the share of wrong ones. The
     compass is wrong by `compass_deg`."""
     rng, gps_off_m = np.random.default_rng(seed), np.zeros(2)
     for t_s in map(float, range(seconds)):
         at_m, heading_deg = way(t_s)
         after_m, _ = way(t_s + 0.01)
-        gps_off_m = (1 - 1 / GPS_LASTS_S) * gps_off_m + rng.normal(0, GPS_SD_M * math.sqrt(2 / GPS_LASTS_S), 2)
+        gps_off_m = (1 - 1 / GPS_TAU_S) * gps_off_m + rng.normal(0, GPS_SD_M * math.sqrt(2 / GPS_TAU_S), 2)
         mount_m = HEIGHT_M * picture_axes(heading_deg) @ np.tan(np.radians((RIGHT_DEG, AHEAD_DEG)))
         fix_m = at_m + OFF_M + scale * at_m + mount_m + rng.normal(0, FIX_SD_M, 2)
         if rng.random() < wrong:
@@ -74,25 +74,25 @@ def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said
         told_deg = (heading_deg + compass_deg) % 360
         known = {"heading_deg": told_deg, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
         known |= {"velocity_m_s": tuple(velocity), "gps": receiver_at(gps, GPS_SD_M, t_s)} | said
-        event = match_at(
+        event = make_match(
             Position(*offset_position(*HOME, *fix_m)),
             t_s,
             vehicle_at(*gps, t_s, **known),
             FIX_SD_M,
             (int(t_s),),
-            replace(SEEN, up_deg=told_deg),
+            replace(VIEW, up_deg=told_deg),
         )
         yield replace(event, located=replace(event.located, heading_deg=heading_deg % 360))
 
 
-def surveyed(way, seconds, mount=STRAIGHT_DOWN, **how):
+def run_survey(way, seconds, mount=STRAIGHT_DOWN, **how):
     sightings = MapSurvey(mount, is_level=False)
-    for event in events(way, seconds, **how):
+    for event in make_matches(way, seconds, **how):
         sightings.add_match(event)
     return sightings.compute_result()
 
 
-def wrong_m(found):
+def measure_offset_error_m(found):
     """Metres (2,) by which the offset that was found is wrong in the middle of the flight."""
     middle_m = np.array(offset_m(*HOME, found.middle.lat_deg, found.middle.lon_deg))
     return np.array(found.measures["off_m"].value) - OFF_M - SCALE * middle_m
@@ -102,9 +102,9 @@ def wrong_m(found):
 @pytest.mark.parametrize("way", [eight, lanes])
 def test_survey_separates_offset_scale_and_mount(way, wrong):
     for seed in range(4):
-        found = surveyed(way, 900, seed=seed, wrong=wrong)
+        found = run_survey(way, 900, seed=seed, wrong=wrong)
         assert all(each.is_known for each in found.measures.values())
-        assert np.abs(wrong_m(found)).max() < 2.5 * found.measures["off_m"].sd < 1.5
+        assert np.abs(measure_offset_error_m(found)).max() < 2.5 * found.measures["off_m"].sd < 1.5
         assert found.measures["scale"].value[0] == pytest.approx(SCALE, abs=2.5 * found.measures["scale"].sd)
         assert found.measures["ahead_deg"].value[0] == pytest.approx(AHEAD_DEG, abs=2 * found.measures["ahead_deg"].sd)
         assert found.measures["right_deg"].value[0] == pytest.approx(RIGHT_DEG, abs=2 * found.measures["right_deg"].sd)
@@ -112,8 +112,8 @@ def test_survey_separates_offset_scale_and_mount(way, wrong):
 
 def test_survey_standard_deviations_match_the_errors():
     """Over many flights the errors are as large as is said, neither half nor double of it."""
-    found = [surveyed(eight, 600, seed=seed) for seed in range(30)]
-    shares = np.array([wrong_m(each) / each.measures["off_m"].sd for each in found])
+    found = [run_survey(eight, 600, seed=seed) for seed in range(30)]
+    shares = np.array([measure_offset_error_m(each) / each.measures["off_m"].sd for each in found])
     assert 0.5 < np.sqrt(np.mean(shares**2)) < 1.2
     shares = np.array([(each.measures["scale"].value[0] - SCALE) / each.measures["scale"].sd for each in found])
     assert 0.5 < np.sqrt(np.mean(shares**2)) < 1.2
@@ -121,17 +121,17 @@ def test_survey_standard_deviations_match_the_errors():
 
 @pytest.mark.parametrize(("way", "wrong", "known"), [(circle, 0.0, ["off_m", "ahead_deg"]), (line, 0.05, ["scale"])])
 def test_survey_finds_only_what_the_route_separates(way, wrong, known):
-    found = surveyed(way, 900, wrong=wrong)
+    found = run_survey(way, 900, wrong=wrong)
     assert [name for name, each in found.measures.items() if each.is_known] == known
     assert (found.fields()["off_m"] is None) == (way is line)
     if way is circle:
-        assert np.abs(wrong_m(found)).max() < 2.5 * found.measures["off_m"].sd
+        assert np.abs(measure_offset_error_m(found)).max() < 2.5 * found.measures["off_m"].sd
         ahead = found.measures["ahead_deg"]
         assert ahead.value[0] == pytest.approx(AHEAD_DEG, abs=2 * ahead.sd)
 
 
 def test_survey_measures_the_mount_from_image_rotation_with_a_wrong_compass():
-    found = surveyed(lanes, 600, compass_deg=90.0)
+    found = run_survey(lanes, 600, compass_deg=90.0)
     assert found.measures["ahead_deg"].value[0] == pytest.approx(AHEAD_DEG, abs=1.0)
     assert found.measures["right_deg"].value[0] == pytest.approx(RIGHT_DEG, abs=1.0)
 
@@ -149,14 +149,14 @@ def test_survey_measures_the_mount_from_image_rotation_with_a_wrong_compass():
     ],
 )
 def test_survey_finds_nothing_without_gps_or_attitude(said):
-    assert surveyed(lanes, 300, **said) is None
+    assert run_survey(lanes, 300, **said) is None
 
 
 def test_survey_uses_the_receiver_and_not_a_position_derived_from_ours():
     """After a fix of ours the autopilot may repeat it: the receiver itself counts, which is 0.1 s late here."""
     rng = np.random.default_rng(3)
     sightings = MapSurvey(STRAIGHT_DOWN, is_level=False)
-    for event in events(lanes, 900):
+    for event in make_matches(lanes, 900):
         vehicle, v = event.vehicle, event.vehicle.velocity_m_s
         late = offset_position(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
         ours = offset_position(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
@@ -164,18 +164,18 @@ def test_survey_uses_the_receiver_and_not_a_position_derived_from_ours():
         vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
         sightings.add_match(replace(event, vehicle=vehicle))
     found = sightings.compute_result()
-    assert np.abs(wrong_m(found)).max() < 2.5 * found.measures["off_m"].sd
+    assert np.abs(measure_offset_error_m(found)).max() < 2.5 * found.measures["off_m"].sd
     assert found.measures["ahead_deg"].value[0] == pytest.approx(AHEAD_DEG, abs=found.measures["ahead_deg"].sd)
 
 
-def levelled(event, mount, was):
+def relevel(event, mount, was):
     """The position of a match if its picture is levelled by another mount than it was."""
     now, before = (np.tan(np.radians((each.right_deg, each.ahead_deg))) for each in (mount, was))
     east_m, north_m = HEIGHT_M * picture_axes(event.vehicle.heading_deg) @ (now - before)
     return move_position(event.located.position, -east_m, -north_m)
 
 
-class Flown:
+class SurveyRun:
     """A surveyor that has heard a flight; `lines` are its lines of the log, `texts` what the ground was told."""
 
     def __init__(self, folder, flight, map_sd_m=5.0, **source):
@@ -189,7 +189,7 @@ class Flown:
             for event in flight:
                 clock.now_s = event.frame.t_mono_s
                 if self.mounts:
-                    located = replace(event.located, position=levelled(event, self.mounts[-1], beside))
+                    located = replace(event.located, position=relevel(event, self.mounts[-1], beside))
                     event = replace(event, located=located)
                 watch.update(event)
                 surveyor.update(event)
@@ -201,7 +201,7 @@ class Flown:
 
 
 def test_survey_is_reported_once_and_at_the_end(tmp_path):
-    flown = Flown(tmp_path, events(eight, 1800))
+    flown = SurveyRun(tmp_path, make_matches(eight, 1800))
     *_, last = flown.lines
     assert 2 <= len(flown.lines) <= 5, "one for each that becomes known, and the end"
     assert last["t_mono_s"] == flown.last
@@ -213,23 +213,23 @@ def test_survey_is_reported_once_and_at_the_end(tmp_path):
     assert all(len(text.encode()) <= 50 and not text.endswith("...") for text in flown.texts)
 
 
-def right(way=lanes, seconds=900):
+def make_correct_matches(way=lanes, seconds=900):
     """The matches of a map and a camera that are right."""
     rng = np.random.default_rng(2)
-    for event in events(way, seconds):
+    for event in make_matches(way, seconds):
         at = Position(*offset_position(event.vehicle.lat_deg, event.vehicle.lon_deg, *rng.normal(0, FIX_SD_M, 2)))
         yield replace(event, located=replace(event.located, position=at))
 
 
 def test_survey_does_not_report_a_correct_map_and_camera(tmp_path):
-    flown = Flown(tmp_path, right())
+    flown = SurveyRun(tmp_path, make_correct_matches())
     assert flown.texts == []
     (end,) = flown.lines
     assert end["off_m"] == pytest.approx([0.0, 0.0], abs=1.0)
     assert end["ahead_deg"] == pytest.approx(0.0, abs=1.0)
 
 
-def led(law, flight):
+def mislead(law, flight):
     """A flight whose receiver is led to the east by a law of time."""
     for event in flight:
         away_m = law(event.frame.t_mono_s)
@@ -252,11 +252,11 @@ def led(law, flight):
     ],
 )
 def test_survey_learns_nothing_from_wrong_gps(tmp_path, law, way):
-    assert Flown(tmp_path, led(law, right(way))).lines == []
+    assert SurveyRun(tmp_path, mislead(law, make_correct_matches(way))).lines == []
 
 
 def test_survey_withdraws_its_report_when_gps_becomes_wrong(tmp_path):
-    flown = Flown(tmp_path, led(lambda t_s: 60.0 * (t_s > 700), events(eight, 1200)))
+    flown = SurveyRun(tmp_path, mislead(lambda t_s: 60.0 * (t_s > 700), make_matches(eight, 1200)))
     assert flown.lines[0]["off_m"]
     assert "off_m" not in flown.lines[-1]
     assert flown.lines[-1]["note"]["code"] == "SURVEY_WITHDRAWN"
@@ -266,7 +266,7 @@ def test_survey_withdraws_its_report_when_gps_becomes_wrong(tmp_path):
 @pytest.mark.parametrize("map_sd_m", [5.0, 1.0])
 @pytest.mark.parametrize("way", [eight, lanes, circle])
 def test_images_are_levelled_by_the_measured_mount_so_that_gps_agrees(tmp_path, way, map_sd_m):
-    flown = Flown(tmp_path, events(way, 1800, scale=0.0), map_sd_m)
+    flown = SurveyRun(tmp_path, make_matches(way, 1800, scale=0.0), map_sd_m)
     known_s = next(line["t_mono_s"] for line in flown.lines if line["ahead_deg"])
     assert known_s < 400
     assert flown.alarms_s, "until then, each turn contradicts GPS"
@@ -278,6 +278,6 @@ def test_images_are_levelled_by_the_measured_mount_so_that_gps_agrees(tmp_path, 
 
 
 def test_survey_finds_spoofed_gps_after_measuring_the_mount(tmp_path):
-    flown = Flown(tmp_path, led(lambda t_s: max(0.0, t_s - 1500), events(eight, 1800, scale=0.0)))
+    flown = SurveyRun(tmp_path, mislead(lambda t_s: max(0.0, t_s - 1500), make_matches(eight, 1800, scale=0.0)))
     assert 1500 < min(t_s for t_s in flown.alarms_s if t_s > 1450) < 1530
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5), "a mount that is known stays"

@@ -31,7 +31,7 @@ def numbers(lines) -> list[int]:
 
 
 @pytest.fixture
-def flown(path) -> list[Path]:
+def log_files(path) -> list[Path]:
     """The files of two flights, of two and of four files with a query each."""
     fly(path, range(2), version="1")
     fly(path, range(100, 104), version="2")
@@ -40,32 +40,32 @@ def flown(path) -> list[Path]:
     return files
 
 
-def test_select_last_flight_reads_the_whole_flight_with_one_start_line(path, flown):
+def test_select_last_flight_reads_the_whole_flight_with_one_start_line(path, log_files):
     whole = select_last_flight(path)
     lines = list(whole)
     assert [line["kind"] for line in lines] == ["start", *["query"] * 4, "end"]
     assert (lines[0]["version"], "repeated" in lines[0]) == ("2", False)
     assert numbers(lines) == [100, 101, 102, 103]
-    assert list(whole.files) == flown[2:]
+    assert list(whole.files) == log_files[2:]
     assert whole.missing is None
     assert list(whole) == lines, "it can be read twice"
 
 
-def test_select_last_flight_reads_up_to_the_end_of_a_numbered_file(flown):
-    assert numbers(select_last_flight(flown[0])) == [0]
-    assert numbers(select_last_flight(flown[1])) == [0, 1]
-    assert numbers(select_last_flight(flown[4])) == [100, 101, 102]
+def test_select_last_flight_reads_up_to_the_end_of_a_numbered_file(log_files):
+    assert numbers(select_last_flight(log_files[0])) == [0]
+    assert numbers(select_last_flight(log_files[1])) == [0, 1]
+    assert numbers(select_last_flight(log_files[4])) == [100, 101, 102]
 
 
-def test_select_last_flight_reports_a_missing_file_and_reads_the_rest(path, flown):
-    flown[3].unlink()
+def test_select_last_flight_reports_a_missing_file_and_reads_the_rest(path, log_files):
+    log_files[3].unlink()
     whole = select_last_flight(path)
     assert numbers(whole) == [100, 102, 103]
     assert whole.missing == f"Files of this flight before {path} are missing (1): it is read without them."
 
 
-def test_select_last_flight_skips_truncated_lines_of_each_file(path, flown):
-    for each in flown[2:5]:
+def test_select_last_flight_skips_truncated_lines_of_each_file(path, log_files):
+    for each in log_files[2:5]:
         os.truncate(each, each.stat().st_size - 10)
     with open(path, "ab") as newest:
         newest.write(b'{"kind": "query", "n": 10')

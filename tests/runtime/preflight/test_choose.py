@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_costs import REGIONS, VECTOR, found
+from example_costs import REGIONS, VECTOR, make_accuracy
 
 from edgevpr import techniques
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
@@ -34,12 +34,12 @@ COSTS = {"regions": REGIONS, "vector": VECTOR}
 @pytest.fixture
 def accuracies(monkeypatch):
     """Regions find more than vectors; a test may change it."""
-    table = {"regions": found(0.9), "vector": found(0.5)}
+    table = {"regions": make_accuracy(0.9), "vector": make_accuracy(0.5)}
     monkeypatch.setattr(choosing, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return table
 
 
-def options_of(board, costs, places):
+def make_options(board, costs, places):
     demand = Demand(places=places, rate_hz=1.0, budget_mb=100)
     return [make_option(board, name, name, cost, demand) for name, cost in costs.items()]
 
@@ -48,8 +48,8 @@ def fit(board, costs, places, rate_hz=1.0):
     return make_option(board, "regions", "regions", costs, Demand(places=places, rate_hz=rate_hz, budget_mb=100))
 
 
-def chosen(board, costs, places):
-    option = choose_best(options_of(board, costs, places), board)
+def choose_label(board, costs, places):
+    option = choose_best(make_options(board, costs, places), board)
     return option and option.label
 
 
@@ -110,24 +110,24 @@ def test_probe_excludes_the_load_of_other_programs():
 
 
 def test_choose_best_returns_the_most_accurate_that_fits(accuracies):
-    assert chosen(board(), COSTS, places=100) == "regions"
-    assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
-    assert chosen(board(), COSTS, places=300) == "vector", "regions are too slow"
-    assert chosen(board(technique="vector"), COSTS, 100) == "vector", "the board's own goes before a better one"
+    assert choose_label(board(), COSTS, places=100) == "regions"
+    assert choose_label(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
+    assert choose_label(board(), COSTS, places=300) == "vector", "regions are too slow"
+    assert choose_label(board(technique="vector"), COSTS, 100) == "vector", "the board's own goes before a better one"
     of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
-    assert chosen(board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
+    assert choose_label(board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
     del accuracies["regions"]
-    assert chosen(board(), COSTS, 100) == "vector", "what was never measured"
-    assert chosen(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
+    assert choose_label(board(), COSTS, 100) == "vector", "what was never measured"
+    assert choose_label(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
 
 
 def test_choose_best_never_returns_one_that_accepted_wrong_places(accuracies):
-    accuracies["regions"] = found(0.9, wrong=1)
-    assert chosen(board(), COSTS, 100) == "vector"
-    assert chosen(board(technique="regions"), COSTS, 100) == "vector"
-    accuracies["vector"] = found(0.5, wrong=2)
-    assert chosen(board(), COSTS, 100) is None
-    why = explain_no_choice(options_of(board(), COSTS, 100), board())
+    accuracies["regions"] = make_accuracy(0.9, wrong=1)
+    assert choose_label(board(), COSTS, 100) == "vector"
+    assert choose_label(board(technique="regions"), COSTS, 100) == "vector"
+    accuracies["vector"] = make_accuracy(0.5, wrong=2)
+    assert choose_label(board(), COSTS, 100) is None
+    why = explain_no_choice(make_options(board(), COSTS, 100), board())
     assert "regions accepted 1 " in why
     assert "vector accepted 2 " in why
 
@@ -168,7 +168,7 @@ def test_make_option_refuses_rates_at_which_fixes_would_be_too_late():
 
 @pytest.mark.slow
 def test_pick_technique_skips_a_missing_network(monkeypatch, caplog, accuracies):
-    accuracies["cohog"] = found(0.9)
+    accuracies["cohog"] = make_accuracy(0.9)
     really = pick.make_technique
 
     def made_for(threads, name, settings=None):

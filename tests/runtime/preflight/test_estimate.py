@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from example_costs import REGIONS, found
+from example_costs import REGIONS, make_accuracy
 from example_costs import VECTOR as ONE_CORE_VECTOR
 
 from edgevpr.core.types import StageCost
@@ -24,7 +24,7 @@ PI = load_board("rpi-4b")
 @pytest.fixture(autouse=True)
 def accuracies(monkeypatch):
     recalls = {"regions": 0.9, "vector": 0.5, "cohog": 0.9, "hog": 0.4, "hog 1bit": 0.2}
-    table = {label: found(recall) for label, recall in recalls.items()}
+    table = {label: make_accuracy(recall) for label, recall in recalls.items()}
     monkeypatch.setattr(choose, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return table
 
@@ -34,7 +34,7 @@ def trials(costs):
 
 
 @pytest.fixture
-def on_board(monkeypatch):
+def on_this_board(monkeypatch):
     """The estimate is made on the board itself."""
     monkeypatch.setattr(Board, "is_this_machine", lambda board: True)
 
@@ -43,7 +43,7 @@ def estimate(costs, plan=PLAN, board=PI):
     return estimate_flight(board, trials(costs), plan)
 
 
-@pytest.mark.usefixtures("on_board")
+@pytest.mark.usefixtures("on_this_board")
 def test_estimate_of_a_flight_on_the_board_itself_by_hand():
     regions, vector = estimate(COSTS).techniques
     option, query = regions.option, regions.query
@@ -63,7 +63,7 @@ def test_estimate_of_a_flight_on_the_board_itself_by_hand():
     assert regions.flight_pack_frac == pytest.approx(regions.flight_mah / 5200)
 
 
-@pytest.mark.usefixtures("on_board")
+@pytest.mark.usefixtures("on_this_board")
 def test_estimate_uses_no_rate_beyond_reach():
     fast = estimate(COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
@@ -93,7 +93,7 @@ def test_estimate_of_another_board_uses_counted_instructions_and_reports_it(boar
     assert all(part in note for part, note in zip(notes, estimated.notes, strict=True))
 
 
-@pytest.mark.usefixtures("on_board")
+@pytest.mark.usefixtures("on_this_board")
 def test_estimate_on_the_board_itself_notes_unverified_power_alone():
     estimated = estimate(COSTS, board=load_board("rpi-zero-2w"))
     assert (estimated.times, estimated.unknown) == ("measured", ())
@@ -101,7 +101,7 @@ def test_estimate_on_the_board_itself_notes_unverified_power_alone():
     assert "The power of Raspberry Pi Zero 2 W is unverified" in note
 
 
-@pytest.mark.usefixtures("on_board")
+@pytest.mark.usefixtures("on_this_board")
 def test_estimate_recommends_the_most_accurate_that_fits_with_the_reason():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
     estimated = estimate(forms, board=replace(PI, technique=None))

@@ -15,12 +15,12 @@ _LENS = Lens(math.degrees(2 * math.atan(Camera().width / 2 / Camera().focal_px))
 _LIGHT = Light(sun_azimuth_deg=50, sun_elevation_deg=50)
 
 
-def lit_ground(east_m: float, north_m: float) -> np.ndarray:
+def light_ground(east_m: float, north_m: float) -> np.ndarray:
     """Ground of this size, in the light of a day."""
     return light_scene(make_scene(5, east_m, north_m, _METRES_PER_PIXEL), _LIGHT, 5)
 
 
-def view_from(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None) -> LevelledImage:
+def take_level_view(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None) -> LevelledImage:
     """The levelled picture from a pose; `told` is the pose that the autopilot reports."""
     image = photograph(ground, _METRES_PER_PIXEL, pose, Camera(), _LIGHT, np.random.default_rng(1))
     names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")

@@ -15,8 +15,8 @@ from edgevpr.runtime.recognise.agreement import (
 from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmarks, pack_bytes, unpack_bytes
 from edgevpr.techniques import create
 
-WIDE = 640
-HIGH = 480
+WIDTH_PX = 640
+HEIGHT_PX = 480
 
 
 @pytest.fixture(scope="module")
@@ -25,24 +25,24 @@ def landscape():
     return rough_ground(1600)
 
 
-def cut(landscape, x, y, up_deg=0.0, scale=1.0):
+def cut_picture(landscape, x, y, up_deg=0.0, scale=1.0):
     """A picture whose middle is at (x, y) of the landscape, from a camera that is turned clockwise by `up_deg` and
     `scale` times as high."""
     turn = np.deg2rad(up_deg)
     # A pixel right in the picture is one right in the landscape, turned clockwise with the camera.
     a, b = scale * np.cos(turn), scale * np.sin(turn)
-    middle = (WIDE - 1) / 2, (HIGH - 1) / 2
+    middle = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
     to_landscape = np.array(
         [[a, -b, x - a * middle[0] + b * middle[1]], [b, a, y - b * middle[0] - a * middle[1]]], np.float64
     )
-    return cv2.warpAffine(landscape, to_landscape, (WIDE, HIGH), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    return cv2.warpAffine(landscape, to_landscape, (WIDTH_PX, HEIGHT_PX), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
-def asked(image):
+def detect_query(image):
     return detect_landmarks(image, count=QUERY_LANDMARKS)
 
 
-def kept(image):
+def detect_stored(image):
     return unpack_bytes(pack_bytes(detect_landmarks(image)))
 
 
@@ -53,11 +53,11 @@ def kept(image):
 )
 def test_measure_agreement_has_the_signs_of_a_cohog_match(landscape, right_px, down_px, rotation_deg, scale):
     """The query's middle lies right of the place's by `right_px`, and below it by `down_px`."""
-    place = cut(landscape, 800, 600)
-    query = cut(landscape, 800 + right_px, 600 + down_px, rotation_deg, scale)
-    found = measure_agreement(asked(query), kept(place))
+    place = cut_picture(landscape, 800, 600)
+    query = cut_picture(landscape, 800 + right_px, 600 + down_px, rotation_deg, scale)
+    found = measure_agreement(detect_query(query), detect_stored(place))
     assert found.inliers >= MIN_PROVEN_INLIERS
-    assert np.array(found.shift_share) * WIDE == pytest.approx((right_px, down_px), abs=2)
+    assert np.array(found.shift_share) * WIDTH_PX == pytest.approx((right_px, down_px), abs=2)
     assert abs((found.rotation_deg - rotation_deg + 180) % 360 - 180) < 1
     assert found.scale == pytest.approx(scale, rel=0.02)
 
@@ -67,7 +67,7 @@ def test_measure_agreement_has_the_signs_of_a_cohog_match(landscape, right_px, d
     assert np.array(match.shift_cells) / 32 == pytest.approx(found.shift_share, abs=1.5 / 32)
 
     expected = Overlay((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)
-    guided = compare_near(asked(query), kept(place), expected)
+    guided = compare_near(detect_query(query), detect_stored(place), expected)
     assert guided.is_expected
     assert guided.inliers >= MIN_PROVEN_INLIERS
     assert guided.shift_share == pytest.approx(found.shift_share, abs=0.005)
@@ -75,8 +75,8 @@ def test_measure_agreement_has_the_signs_of_a_cohog_match(landscape, right_px, d
 
 @pytest.mark.parametrize("seed", range(6))
 def test_pictures_of_other_ground_do_not_agree(landscape, seed):
-    other = textured(100 + seed, HIGH, WIDE)
+    other = textured(100 + seed, HEIGHT_PX, WIDTH_PX)
     expected = Overlay((0.05 * (seed % 3), -0.05), 15.0 * seed)
-    found = compare_near(asked(other), kept(cut(landscape, 800, 600)), expected)
+    found = compare_near(detect_query(other), detect_stored(cut_picture(landscape, 800, 600)), expected)
     assert found.inliers < MIN_CONFIRMED_INLIERS
     assert found.is_expected

@@ -8,13 +8,13 @@ from edgevpr.runtime.recognise.place_filter import make_motion
 
 PLACES = 100
 SPACING_M = 20.0
-IN_ORDER = MapScale(spacing=1.0, near=2.0, is_ordinal=True)
-IN_METRES = MapScale(spacing=SPACING_M, near=30.0)
+ORDER_SCALE = MapScale(spacing=1.0, near=2.0, is_ordinal=True)
+METRIC_SCALE = MapScale(spacing=SPACING_M, near=30.0)
 STEP = make_motion(1.0, 3.0)  # within three places of the query before
-SURE = 0.999
+CERTAIN = 0.999
 
 
-def seen(at, p, sd=0.5, heading_deg=np.nan):
+def make_evidence(at, p, sd=0.5, heading_deg=np.nan):
     """Evidence for positions `at` (K, 2), or (K,) in a map of places in order."""
     at = np.asarray(at, float)
     at = np.column_stack([at, np.zeros(len(at))]) if at.ndim == 1 else at
@@ -26,24 +26,24 @@ def seen(at, p, sd=0.5, heading_deg=np.nan):
     )
 
 
-def view_of(place, rng, p=0.8, clutter=8):
+def make_place_evidence(place, rng, p=0.8, clutter=8):
     """What a query over a place says: it and its neighbours, and some places elsewhere."""
     near = round(place) + np.array([-1, 0, 1])
     near = near[(near >= 0) & (near < PLACES)]
     elsewhere = rng.choice(PLACES, clutter, replace=False)
     shares = np.exp(-abs(near - place))
     weak = rng.random(clutter)
-    return seen([*near, *elsewhere], [*(p * shares / shares.sum()), *(0.5 * (1 - p) * weak / weak.sum())])
+    return make_evidence([*near, *elsewhere], [*(p * shares / shares.sum()), *(0.5 * (1 - p) * weak / weak.sum())])
 
 
-def view_of_nothing(rng, clutter=10):
+def make_foreign_evidence(rng, clutter=10):
     """What a query over ground that is not in the map says: a little of everything."""
     p = rng.random(clutter) * rng.choice([0.05, 0.2])
-    return seen(rng.choice(PLACES, clutter, replace=False), p / clutter)
+    return make_evidence(rng.choice(PLACES, clutter, replace=False), p / clutter)
 
 
 def fly(belief, places, rng, p=0.8):
-    return [belief.update(view_of(place, rng, p), STEP, PLACES) for place in places]
+    return [belief.update(make_place_evidence(place, rng, p), STEP, PLACES) for place in places]
 
 
 def is_at(posterior, place):
@@ -52,17 +52,17 @@ def is_at(posterior, place):
 
 @pytest.mark.parametrize("start", ["lost", "known"])
 def test_update_gives_a_query_that_fits_no_history_its_own_confidence(start):
-    rng, belief = np.random.default_rng(1), Belief(IN_ORDER)
+    rng, belief = np.random.default_rng(1), Belief(ORDER_SCALE)
     for n in range(10):
-        belief.update(view_of_nothing(rng) if start == "lost" else view_of(10 + n, rng), STEP, PLACES)
-    assert belief.update(seen([80], [0.9]), STEP, PLACES).mass < 0.9
+        belief.update(make_foreign_evidence(rng) if start == "lost" else make_place_evidence(10 + n, rng), STEP, PLACES)
+    assert belief.update(make_evidence([80], [0.9]), STEP, PLACES).mass < 0.9
 
 
 @pytest.mark.parametrize("speed", [0.5, 1, 2, -0.5, -1, -2])
 def test_update_gains_confidence_from_consistent_queries(speed):
     places = (20 if speed > 0 else 80) + speed * np.arange(25)
-    posteriors = fly(Belief(IN_ORDER), places, np.random.default_rng(2))
-    assert max(each.mass for each in posteriors) >= SURE
+    posteriors = fly(Belief(ORDER_SCALE), places, np.random.default_rng(2))
+    assert max(each.mass for each in posteriors) >= CERTAIN
     assert all(each.mass > 0.99 for each in posteriors[12:])
     assert all(is_at(each, place) for each, place in zip(posteriors, places, strict=True))
     assert posteriors[0].mass < 0.85
@@ -70,39 +70,39 @@ def test_update_gains_confidence_from_consistent_queries(speed):
 
 @pytest.mark.parametrize("p", [0.3, 0.6, 0.9])
 def test_update_does_not_gain_confidence_in_a_hover_over_look_alikes(p):
-    belief = Belief(IN_ORDER)
-    masses = [belief.update(seen([50], [p]), STEP, PLACES).mass for _ in range(300)]
+    belief = Belief(ORDER_SCALE)
+    masses = [belief.update(make_evidence([50], [p]), STEP, PLACES).mass for _ in range(300)]
     assert max(masses) <= p + 1e-9
 
 
 def test_update_replaces_the_previous_query_in_a_hover():
-    belief = Belief(IN_ORDER)
+    belief = Belief(ORDER_SCALE)
     for p in (0.9, 0.2, 0.6):
-        mass = belief.update(seen([50], [p]), STEP, PLACES).mass
+        mass = belief.update(make_evidence([50], [p]), STEP, PLACES).mass
     assert 0.2 < mass < 0.65
-    assert belief.update(seen([50], [0.1]), STEP, PLACES).mass < 0.35
+    assert belief.update(make_evidence([50], [0.1]), STEP, PLACES).mass < 0.35
 
 
 @pytest.mark.parametrize("p", [0.05, 0.2, 0.4])
 @pytest.mark.parametrize("places", [100, 10_000])
 def test_update_refuses_foreign_ground_that_resembles_the_map_slightly(p, places):
-    belief = Belief(IN_ORDER)
-    masses = [belief.update(seen([10 + n], [p]), STEP, places).mass for n in range(80)]
-    assert max(masses) < SURE
+    belief = Belief(ORDER_SCALE)
+    masses = [belief.update(make_evidence([10 + n], [p]), STEP, places).mass for n in range(80)]
+    assert max(masses) < CERTAIN
 
 
-def over(track_m, belief, odometry, p=0.8):
+def fly_over(track_m, belief, odometry, p=0.8):
     """Fly over a track (N, 2) in metres; `odometry` makes what it reports from each true step."""
     posteriors = []
     for n, at in enumerate(track_m):
         said = odometry(at - track_m[n - 1]) if n else None
         beside = at + np.array([300.0 * np.cos(7 * n), 300.0 * np.sin(7 * n)])
-        query = seen([at, beside], [p, (1 - p) / 2], sd=4.0, heading_deg=350.0 if n % 2 else 10.0)
+        query = make_evidence([at, beside], [p, (1 - p) / 2], sd=4.0, heading_deg=350.0 if n % 2 else 10.0)
         posteriors.append(belief.update(query, make_motion(1.0, 40.0, said), PLACES))
     return posteriors
 
 
-LIES = {
+ODOMETRY_FAULTS = {
     "none": lambda step: None,
     "true": tuple,
     "twice": lambda step: tuple(2 * step),
@@ -114,11 +114,11 @@ LIES = {
 }
 
 
-@pytest.mark.parametrize("odometry", LIES.values(), ids=LIES)
+@pytest.mark.parametrize("odometry", ODOMETRY_FAULTS.values(), ids=ODOMETRY_FAULTS)
 @pytest.mark.parametrize("speed_m", [5.0, 20.0, 40.0])
 def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
     track_m = speed_m * np.column_stack([np.arange(30), 0.3 * np.arange(30)])
-    posteriors = over(track_m, Belief(IN_METRES), odometry)
+    posteriors = fly_over(track_m, Belief(METRIC_SCALE), odometry)
     off_m = [np.hypot(*(each.position - at)) for each, at in zip(posteriors, track_m, strict=True)]
     assert max(off_m) < SPACING_M
     assert posteriors[-1].mass > 0.99
@@ -126,13 +126,13 @@ def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
 
 
 def test_update_trusts_no_place_if_all_look_the_same():
-    belief = Belief(IN_ORDER)
+    belief = Belief(ORDER_SCALE)
     for _ in range(60):
-        posterior = belief.update(seen(np.arange(50), np.full(50, 0.98 / 50)), STEP, 50)
+        posterior = belief.update(make_evidence(np.arange(50), np.full(50, 0.98 / 50)), STEP, 50)
         assert posterior.mass < 0.6
 
 
-def some(rng, count, scale):
+def make_random_evidence(rng, count, scale):
     """Any evidence at all, a tenth of it spoilt."""
     p = rng.random(count) ** rng.choice([1, 30])
     at = rng.normal(size=(count, 2)) * scale + rng.choice([0, 1e6])
@@ -144,12 +144,12 @@ def some(rng, count, scale):
     return Proposals(probability=p, position=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10], count))
 
 
-@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
+@pytest.mark.parametrize("ground", [ORDER_SCALE, METRIC_SCALE])
 @pytest.mark.parametrize("places", [1, 1000, 10**6])
 def test_update_accepts_any_numbers(ground, places):
     rng, belief = np.random.default_rng(places), Belief(ground)
     for _ in range(200):
-        query = some(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
+        query = make_random_evidence(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
         velocity = rng.choice([0, 1, -3, np.nan, 1e9, np.inf], 2).tolist()
         elapsed_s = float(rng.choice([1, 1e-9, -1, np.nan, 1e6, 1e12]))
         posterior = belief.update(query, make_motion(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 
 import pytest
 from pictures import textured
-from walks import map_of
+from walks import make_map
 
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
@@ -28,9 +28,9 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
 SHIPPED = {kind: read_default_model(kind) for kind in ("ahead", "ahead_proven")}
-OWN = replace(SHIPPED["ahead"], made_of="this map")
-FOUND = MapCalibration(
-    models={"ahead": OWN},
+OWN_MODEL = replace(SHIPPED["ahead"], made_of="this map")
+CALIBRATION = MapCalibration(
+    models={"ahead": OWN_MODEL},
     made="2026-05-01",
     asked=120,
     precision=0.999,
@@ -46,21 +46,21 @@ def frame(number):
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    return map_of(tmp_path_factory.mktemp("map") / "m.gpkg", create("cohog", {"w1": 208}), map(frame, range(3)))
+def built_map(tmp_path_factory):
+    return make_map(tmp_path_factory.mktemp("map") / "m.gpkg", create("cohog", {"w1": 208}), map(frame, range(3)))
 
 
 @pytest.fixture
-def path(built, tmp_path):
-    return shutil.copy(built, tmp_path / "m.gpkg")
+def path(built_map, tmp_path):
+    return shutil.copy(built_map, tmp_path / "m.gpkg")
 
 
-def keep(path, text):
+def write_calibration(path, text):
     with PlaceMap.open_for_writing(path) as place_map:
         place_map.record_calibration(text)
 
 
-def flown(path):
+def fly_over_map(path):
     """The models by which the flight over a map decides, and whether it recognises its own picture."""
     recogniser = open_recogniser(load_config(None, {"map": str(path)}), load_board("this"), uses_hints=True)
     with recogniser.place_map:
@@ -72,17 +72,17 @@ def flown(path):
 
 
 def test_flight_uses_the_calibrated_models_of_its_map(path, caplog):
-    assert flown(path) == SHIPPED
-    keep(path, format_calibration(FOUND))
-    assert flown(path) == {**SHIPPED, "ahead": OWN}, "an older edgevpr calibrated one of them"
+    assert fly_over_map(path) == SHIPPED
+    write_calibration(path, format_calibration(CALIBRATION))
+    assert fly_over_map(path) == {**SHIPPED, "ahead": OWN_MODEL}, "an older edgevpr calibrated one of them"
     with PlaceMap.open(path) as place_map:
-        assert read_calibration_for(place_map) == FOUND
+        assert read_calibration_for(place_map) == CALIBRATION
     assert not caplog.records
 
 
-def changed(more=(), **figures):
+def change_calibration(more=(), **figures):
     """The text of the calibration with `more` fields or other figures of its model, and its checksum."""
-    stored = json.loads(format_calibration(FOUND)[8:])
+    stored = json.loads(format_calibration(CALIBRATION)[8:])
     stored["models"]["ahead"].update(more)
     stored["models"]["ahead"]["of_map"].update(figures)
     body = json.dumps(stored)
@@ -92,22 +92,22 @@ def changed(more=(), **figures):
 DAMAGED = {
     "empty": "",
     "no json": "deadbeef{",
-    "changed": format_calibration(FOUND).replace("2026", "2025"),
-    "evidence that there is not": changed(names=["colour", *OWN.of_map.names[1:]]),
-    "a kind that there is not": format_calibration(replace(FOUND, models={"sideways": OWN})),
-    "a weight too few": changed(weights=OWN.of_map.weights[1:]),
-    "a field of another version": changed({"of_other_places": []}),
-    "a place that is no number": format_calibration(replace(FOUND, recognisable={"x": 0.5})),
-    "no places": format_calibration(replace(FOUND, recognisable=None)),
+    "changed": format_calibration(CALIBRATION).replace("2026", "2025"),
+    "evidence that there is not": change_calibration(names=["colour", *OWN_MODEL.of_map.names[1:]]),
+    "a kind that there is not": format_calibration(replace(CALIBRATION, models={"sideways": OWN_MODEL})),
+    "a weight too few": change_calibration(weights=OWN_MODEL.of_map.weights[1:]),
+    "a field of another version": change_calibration({"of_other_places": []}),
+    "a place that is no number": format_calibration(replace(CALIBRATION, recognisable={"x": 0.5})),
+    "no places": format_calibration(replace(CALIBRATION, recognisable=None)),
     "a wrong surrogate": "\ud800" * 9,
 }
 
 
 @pytest.mark.parametrize("text", DAMAGED.values(), ids=DAMAGED)
 def test_flight_uses_the_default_model_and_reports_a_damaged_calibration(path, text, caplog):
-    keep(path, text)
+    write_calibration(path, text)
     with caplog.at_level(logging.WARNING):
-        assert flown(path) == SHIPPED
+        assert fly_over_map(path) == SHIPPED
     (record,) = [each for each in caplog.records if "calibration" in each.message]
     assert "map calibrate" in record.message
     assert len(record.message) < 500

@@ -18,7 +18,7 @@ PICTURE = np.full((128, 256), 90, np.uint8)
 
 
 @pytest.fixture
-def opened(models):
+def open_detector(models):
     def open_it(*args, **kwargs):
         write_detector(models, *args, **kwargs)
         return Detector(load_card("tiny"))
@@ -26,15 +26,15 @@ def opened(models):
     return open_it
 
 
-def test_is_static_masks_only_boxes_of_dynamic_classes(opened):
-    static = opened([(16, 8, 32, 24, 2), (40, 40, 60, 60, 3)]).is_static(PICTURE)
+def test_is_static_masks_only_boxes_of_dynamic_classes(open_detector):
+    static = open_detector([(16, 8, 32, 24, 2), (40, 40, 60, 60, 3)]).is_static(PICTURE)
     wanted = np.ones_like(static)
     wanted[16:48, 64:128] = False  # the picture is twice as high and four times as wide as the input
     assert np.array_equal(static, wanted)
 
 
-def test_is_static_places_boxes_correctly_in_a_padded_image(opened):
-    static = opened([(16, 8, 32, 24, 0)], pad=114).is_static(PICTURE)  # 64 x 32 of the input show the picture
+def test_is_static_places_boxes_correctly_in_a_padded_image(open_detector):
+    static = open_detector([(16, 8, 32, 24, 0)], pad=114).is_static(PICTURE)  # 64 x 32 of the input show the picture
     wanted = np.ones_like(static)
     wanted[32:96, 64:128] = False
     assert np.array_equal(static, wanted)
@@ -48,9 +48,9 @@ def test_is_static_places_boxes_correctly_in_a_padded_image(opened):
         (np.zeros((1, 7, 9), np.float32), "not those of a `yolox` detector"),
     ],
 )
-def test_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, complaint):
+def test_detector_that_cannot_be_used_is_refused_in_one_sentence(open_detector, raw, complaint):
     with pytest.raises(ModelError, match=complaint) as refused:
-        opened(raw=raw)
+        open_detector(raw=raw)
     assert "\n" not in str(refused.value)
 
 

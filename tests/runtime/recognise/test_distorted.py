@@ -25,7 +25,7 @@ FOCAL_PX = 493.0
 CAMERAS = {"straight": DistortedCamera(FOCAL_PX, (0,) * 4), "wide": wide(), "fisheye": fisheye()}
 SEEN_DEG = {"straight": 2 * math.degrees(math.atan(320 / FOCAL_PX)), "wide": 101.0, "fisheye": 136.0}
 STRAIGHT = {"height_m": 100.0, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
-ON_THE_WAY = [
+ROUTE_M = [
     (262.0, 196.0, {"heading_deg": 40.0}),
     (240.0, 310.0, {"roll_deg": 10.0, "pitch_deg": -6.0, "heading_deg": 200.0}),
     (255.0, 205.0, {"height_m": 80.0, "pitch_deg": 12.0}),
@@ -67,12 +67,12 @@ def maps(ground, lenses, tmp_path_factory):
     return made
 
 
-def off_m(map_path, camera, ground, **source):
+def errors_m(map_path, camera, ground, **source):
     """How far off the positions of accepted queries are; None for one that is not accepted."""
     settings = load_config(None, {"map": map_path, **{f"source.{key}": value for key, value in source.items()}})
     recogniser, found = open_recogniser(settings, load_board("this")), []
     with recogniser.place_map:
-        for east_m, north_m, changed in ON_THE_WAY:
+        for east_m, north_m, changed in ROUTE_M:
             pose = STRAIGHT | changed
             image = camera.photograph(ground, M_PER_PX, east_m=east_m, north_m=north_m, **pose)
             event = recogniser.step(Frame(image=image, name="it", t_mono_s=0.0, **pose))
@@ -85,15 +85,15 @@ def off_m(map_path, camera, ground, **source):
 
 @pytest.mark.parametrize(("of", "by"), [("straight", "wide"), ("wide", "fisheye"), ("fisheye", "straight")])
 def test_cameras_find_their_position_in_the_map_of_any_camera(maps, lenses, ground, of, by):
-    assert max(off_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
+    assert max(errors_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
 
 
 def test_positions_are_wrong_without_a_calibration(maps, ground):
-    found = off_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
+    found = errors_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
     assert max(each or math.inf for each in found) > 5.0
 
 
 def test_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
     with pytest.raises(UsageError, match=r"`source\.fov_deg` is 66"):
-        off_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=66.0)
-    assert off_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=SEEN_DEG["wide"])
+        errors_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=66.0)
+    assert errors_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=SEEN_DEG["wide"])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sureness import agreed, bare_index
+from sureness import agreeing, make_bare_index
 
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode
@@ -28,11 +28,11 @@ from edgevpr.runtime.recognise.evidence import (
 )
 from edgevpr.techniques import create
 
-INDEX = bare_index(30)
+INDEX = make_bare_index(30)
 NEIGHBOUR_M = 50.0
 
 
-def ranked(matches):
+def rank(matches):
     """A ranking of matches by their slots, best first."""
     slots = sorted(matches, key=lambda slot: -matches[slot].score)
     return Ranking(
@@ -42,27 +42,27 @@ def ranked(matches):
     )
 
 
-def ahead(score, back=0.2, likeness=0.7, log_rank=0.0):
+def forward(score, back=0.2, likeness=0.7, log_rank=0.0):
     support = Support(back=back, likeness=likeness, log_rank=log_rank)
     return FineMatch(score, coverage=0.3, support=support)
 
 
-def looked_ahead(matches, look_alikes=None):
+def see_forward(matches, look_alikes=None):
     index = replace(INDEX, place_ids=np.arange(len(INDEX)))
-    return gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), looks_down=False, look_alikes=look_alikes)
+    return gather_evidence(rank(matches), index, NEIGHBOUR_M, None, (), looks_down=False, look_alikes=look_alikes)
 
 
-def looked_down(matches, proof=None, same=(), tried=1.0):
-    return gather_evidence(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, proof, same, looks_down=True)
+def see_down(matches, proof=None, same=(), tried=1.0):
+    return gather_evidence(replace(rank(matches), tried=tried), INDEX, NEIGHBOUR_M, proof, same, looks_down=True)
 
 
 def test_evidence_has_the_features_of_the_models():
     down = {5: FineMatch(0.2, coverage=0.3)}
     for kind, evidence in (
-        (AHEAD, looked_ahead({5: ahead(0.2)})),
-        (AHEAD_PROVEN, replace(looked_ahead({5: ahead(0.2)}), proof=0.1)),
-        (DOWN, looked_down(down, agreed(12))),
-        (DOWN_BARE, looked_down(down)),
+        (AHEAD, see_forward({5: forward(0.2)})),
+        (AHEAD_PROVEN, replace(see_forward({5: forward(0.2)}), proof=0.1)),
+        (DOWN, see_down(down, agreeing(12))),
+        (DOWN_BARE, see_down(down)),
     ):
         assert evidence.kind == kind
         assert set(evidence.figures()) >= {*MAP_FIGURES[kind], *PLACE_FIGURES[kind]}
@@ -70,16 +70,16 @@ def test_evidence_has_the_features_of_the_models():
 
 
 def test_gather_evidence_treats_the_next_single_view_as_a_rival():
-    matches = {5: ahead(0.2), 6: ahead(0.19), 20: ahead(0.02)}
-    along_a_way, single = (looked_ahead(matches, LookAlikes(overlap, {})) for overlap in (True, False))
-    assert along_a_way.lead == looked_ahead(matches).lead > single.lead > 0
+    matches = {5: forward(0.2), 6: forward(0.19), 20: forward(0.02)}
+    along_a_way, single = (see_forward(matches, LookAlikes(overlap, {})) for overlap in (True, False))
+    assert along_a_way.lead == see_forward(matches).lead > single.lead > 0
     assert single.twin is None
 
 
 @pytest.mark.parametrize("overlap", [True, False])
 def test_gather_evidence_compares_with_the_most_similar_place(overlap):
     known = LookAlikes(overlap, {5: LookAlike(20, math.log(0.1), math.log(0.08)), 20: LookAlike(5, -3.0, -2.5)})
-    of_twin, of_another = (looked_ahead({5: ahead(a), 20: ahead(b)}, known) for a, b in ((0.2, 0.1), (0.1, 0.2)))
+    of_twin, of_another = (see_forward({5: forward(a), 20: forward(b)}, known) for a, b in ((0.2, 0.1), (0.1, 0.2)))
     assert of_twin.twin == pytest.approx(math.log(0.1 / 0.08))
     assert of_twin.has_twin
     assert not replace(of_twin, lead=math.log(4.01)).has_twin, "it is clearly beaten"
@@ -88,24 +88,24 @@ def test_gather_evidence_compares_with_the_most_similar_place(overlap):
     assert known.twins == 1
 
 
-AHEAD_OF_ALL = replace(looked_ahead({5: ahead(0.2)}), lead=math.log(1.51), rank_gap=0.0)
-HARDLY_AHEAD = replace(AHEAD_OF_ALL, lead=math.log(1.49))
+CLEAR_LEAD = replace(see_forward({5: forward(0.2)}), lead=math.log(1.51), rank_gap=0.0)
+SMALL_LEAD = replace(CLEAR_LEAD, lead=math.log(1.49))
 
 
 @pytest.mark.parametrize(
     ("evidence", "needed"),
     [
-        (AHEAD_OF_ALL, False),
-        (HARDLY_AHEAD, True),
-        (replace(HARDLY_AHEAD, landmarks=log_count(8)), True),
-        (replace(HARDLY_AHEAD, landmarks=log_count(9)), False),
-        (replace(HARDLY_AHEAD, landmarks=log_count(15), rank_gap=0.11, proof=log_inlier_ratio(15, 3)), True),
-        (replace(HARDLY_AHEAD, landmarks=log_count(16), rank_gap=0.11, proof=log_inlier_ratio(16, 3)), False),
-        (replace(AHEAD_OF_ALL, rank_gap=0.11), False),
-        (replace(HARDLY_AHEAD, apart=math.log(1.51)), False),
-        (replace(AHEAD_OF_ALL, apart=math.log(1.49)), True),
-        (replace(AHEAD_OF_ALL, apart=math.log(1.49), proof=log_inlier_ratio(9, 3)), False),
-        (replace(HARDLY_AHEAD, likeness=None), False),
+        (CLEAR_LEAD, False),
+        (SMALL_LEAD, True),
+        (replace(SMALL_LEAD, landmarks=log_count(8)), True),
+        (replace(SMALL_LEAD, landmarks=log_count(9)), False),
+        (replace(SMALL_LEAD, landmarks=log_count(15), rank_gap=0.11, proof=log_inlier_ratio(15, 3)), True),
+        (replace(SMALL_LEAD, landmarks=log_count(16), rank_gap=0.11, proof=log_inlier_ratio(16, 3)), False),
+        (replace(CLEAR_LEAD, rank_gap=0.11), False),
+        (replace(SMALL_LEAD, apart=math.log(1.51)), False),
+        (replace(CLEAR_LEAD, apart=math.log(1.49)), True),
+        (replace(CLEAR_LEAD, apart=math.log(1.49), proof=log_inlier_ratio(9, 3)), False),
+        (replace(SMALL_LEAD, likeness=None), False),
     ],
 )
 def test_needs_landmarks_if_forward_regions_are_not_sufficient(evidence, needed):
@@ -123,10 +123,10 @@ def test_list_evidence_kinds_depends_on_the_camera():
 
 
 def test_gather_evidence_measures_the_lead_over_places_elsewhere_not_neighbours():
-    far, near = (looked_ahead({5: ahead(0.2), other: ahead(0.15)}) for other in (20, 6))
+    far, near = (see_forward({5: forward(0.2), other: forward(0.15)}) for other in (20, 6))
     assert far.lead == pytest.approx(math.log(math.sqrt(0.2 / 0.15)))
     assert near.lead > far.lead, "only chance is elsewhere"
-    down = looked_down({5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.1, coverage=0.3)})
+    down = see_down({5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.1, coverage=0.3)})
     assert down.lead == pytest.approx(math.log(2))
 
 
@@ -134,7 +134,7 @@ def test_gather_evidence_measures_the_lead_over_places_elsewhere_not_neighbours(
 def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_and_by_chance(inliers, rival, times):
     proof = log_inlier_ratio(inliers, rival)
     assert proof == pytest.approx(math.log(times))
-    known = replace(looked_ahead({5: ahead(0.2)}), proof=proof)
+    known = replace(see_forward({5: forward(0.2)}), proof=proof)
     described = known.describe()
     assert described["landmarks_ratio"] == (pytest.approx(times) if proof else None)
     assert (described["coverage_share"] is None) == bool(proof)
@@ -143,37 +143,37 @@ def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_a
 @pytest.mark.parametrize(
     ("proof", "counts"),
     [
-        (agreed(12), 12),
-        (agreed(12, is_expected=False), 0),
-        (agreed(12, shift_share=(0.0, 0.001)), 0),
-        (agreed(0), 0),
+        (agreeing(12), 12),
+        (agreeing(12, is_expected=False), 0),
+        (agreeing(12, shift_share=(0.0, 0.001)), 0),
+        (agreeing(0), 0),
     ],
 )
 def test_landmarks_count_only_if_expected_and_shifted(proof, counts):
-    evidence = looked_down({5: FineMatch(0.2, coverage=0.3)}, proof)
+    evidence = see_down({5: FineMatch(0.2, coverage=0.3)}, proof)
     assert evidence.landmarks == pytest.approx(math.log1p(counts))
 
 
 def test_gather_evidence_treats_a_place_of_the_same_ground_as_the_same_place():
     matches = {5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.19, coverage=0.3), 28: FineMatch(0.05, coverage=0.3)}
     index = type(INDEX)(**(dict(INDEX.arrays) | {"place_ids": np.arange(101, 131)}), mean=INDEX.mean)
-    apart = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), looks_down=True)
-    together = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (121,), looks_down=True)
+    apart = gather_evidence(rank(matches), index, NEIGHBOUR_M, None, (), looks_down=True)
+    together = gather_evidence(rank(matches), index, NEIGHBOUR_M, None, (121,), looks_down=True)
     assert (apart.lead, together.lead) == (pytest.approx(math.log(0.2 / 0.19)), pytest.approx(math.log(4)))
 
 
 @pytest.mark.parametrize("score", [0.0, 1e-9, 1.0])
 def test_gather_evidence_is_finite_for_any_fraction(score):
-    matches = {5: ahead(score, back=0.0), 20: ahead(0.0, back=0.0)}
-    assert all(map(math.isfinite, looked_ahead(matches).figures().values()))
-    assert all(map(math.isfinite, looked_down({5: FineMatch(score), 20: FineMatch(0.0)}).figures().values()))
+    matches = {5: forward(score, back=0.0), 20: forward(0.0, back=0.0)}
+    assert all(map(math.isfinite, see_forward(matches).figures().values()))
+    assert all(map(math.isfinite, see_down({5: FineMatch(score), 20: FineMatch(0.0)}).figures().values()))
 
 
 def test_gather_evidence_is_none_if_nothing_was_compared():
     empty = Ranking(slots=np.array([3]), scores=np.array([0.2], np.float32), compared={})
     for down in (True, False):
         assert gather_evidence(empty, INDEX, NEIGHBOUR_M, None, (), looks_down=down) is None
-    assert looked_ahead({5: FineMatch(0.2)}) is None, "a technique that gives no support"
+    assert see_forward({5: FineMatch(0.2)}) is None, "a technique that gives no support"
 
 
 def test_require_usable_refuses_a_model_of_other_evidence():
@@ -190,7 +190,7 @@ def test_require_usable_refuses_a_model_of_other_evidence():
 
 def test_chance_is_lower_with_a_known_heading():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
-    all_of_them, known = (looked_down(matches, agreed(3), tried=tried).figures() for tried in (1.0, 1 / 8))
+    all_of_them, known = (see_down(matches, agreeing(3), tried=tried).figures() for tried in (1.0, 1 / 8))
     model = read_default_model(DOWN)
     assert 0 < model.chance(known) == pytest.approx(model.chance(all_of_them) / 4)
     assert model.confidence(known) > model.confidence(all_of_them)

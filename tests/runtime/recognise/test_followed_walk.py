@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pictures import textured
-from sureness import sure_rule
-from walks import map_of, walk_over
+from sureness import make_rule
+from walks import make_map, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.reasons import ReasonCode
@@ -23,12 +23,12 @@ pytestmark = pytest.mark.slow
 
 PLACES = 40
 STRIDE = 3
-TWICE = 20, 36  # both places show the same picture
+DUPLICATE_PLACES = 20, 36  # both places show the same picture
 TECHNIQUE = create("cohog", {"w1": 208})
 
 
 def frame(place, t_s=0.0, position=True):
-    shown = TWICE[0] if place == TWICE[1] else place
+    shown = DUPLICATE_PLACES[0] if place == DUPLICATE_PLACES[1] else place
     there = Position(50 + place * 0.0002, 8.0) if position else None
     return Frame(image=textured(shown), name=f"{place}.png", t_mono_s=t_s, t_utc_s=t_s, position=there)
 
@@ -36,16 +36,16 @@ def frame(place, t_s=0.0, position=True):
 @pytest.fixture(scope="module", params=[True, False], ids=["positions", "in order"])
 def whole_map(request, tmp_path_factory):
     frames = (frame(place, position=request.param) for place in range(PLACES))
-    return map_of(tmp_path_factory.mktemp("map") / "m.gpkg", TECHNIQUE, frames)
+    return make_map(tmp_path_factory.mktemp("map") / "m.gpkg", TECHNIQUE, frames)
 
 
-class Walk:
+class TrackedWalk:
     """A flight with or without the flight so far in mind; `confidence` is what each match has by itself."""
 
     def __init__(self, place_map, rule=None, follows=True):
         self.confidence, self._t_s = 0.88, 0.0
         place_filter = PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None
-        rule = rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1)
+        rule = rule or make_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1)
         settings = MatchSettings(candidates=42)
         self.recogniser = walk_over(place_map, TECHNIQUE, rule, settings=settings, place_filter=place_filter)
 
@@ -61,18 +61,18 @@ class Walk:
 @pytest.fixture
 def flight(whole_map, tmp_path):
     with PlaceMap.open(shutil.copy(whole_map, tmp_path)) as place_map:
-        yield Walk(place_map)
+        yield TrackedWalk(place_map)
 
 
 @pytest.fixture
-def alone(whole_map, tmp_path):
+def untracked_walk(whole_map, tmp_path):
     with PlaceMap.open(shutil.copy(whole_map, tmp_path / "alone.gpkg")) as place_map:
-        yield Walk(place_map, follows=False)
+        yield TrackedWalk(place_map, follows=False)
 
 
-def test_tracked_match_is_accepted_although_refused_alone(flight, alone):
+def test_tracked_match_is_accepted_although_refused_alone(flight, untracked_walk):
     way = range(1, 19, STRIDE)
-    alone_events, events = ([walk.see(place) for place in way] for walk in (alone, flight))
+    alone_events, events = ([walk.see(place) for place in way] for walk in (untracked_walk, flight))
     assert not any(event.accepted for event in alone_events)
     assert all(event.track is None for event in alone_events)
     assert [event.accepted for event in events[:1] + events[3:]] == [False] + [True] * 3
@@ -82,10 +82,10 @@ def test_tracked_match_is_accepted_although_refused_alone(flight, alone):
     assert events[0].position is None
 
 
-def test_tracked_match_that_contradicts_the_track_is_refused_with_a_reason(flight, alone):
+def test_tracked_match_that_contradicts_the_track_is_refused_with_a_reason(flight, untracked_walk):
     for place in range(1, 16, STRIDE):
         flight.see(place)
-    assert alone.see(32, 0.9).accepted
+    assert untracked_walk.see(32, 0.9).accepted
     event = flight.see(32, 0.9, elapsed_s=1.0)
     assert (event.accepted, event.position) == (False, None)
     assert event.reason.code is ReasonCode.TRACK_CONTRADICTS
@@ -93,28 +93,28 @@ def test_tracked_match_that_contradicts_the_track_is_refused_with_a_reason(fligh
     assert flight.see(35, 0.9).accepted or flight.see(38, 0.9).accepted, "but not for long"
 
 
-def test_tracked_flight_resolves_two_places_that_look_the_same(flight, alone):
+def test_tracked_flight_resolves_two_places_that_look_the_same(flight, untracked_walk):
     for place in range(24, 36, STRIDE):
         flight.see(place, 0.9)
     # By itself the place that comes first in the map is as good as the other.
-    assert alone.see(TWICE[1], 0.9).best.place.source_image == f"{TWICE[0]}.png"
-    event = flight.see(TWICE[1], 0.9)
-    assert event.best.place.source_image == f"{TWICE[1]}.png"
-    assert event.ranking.slots[0] == event.track.slot == TWICE[1]
+    assert untracked_walk.see(DUPLICATE_PLACES[1], 0.9).best.place.source_image == f"{DUPLICATE_PLACES[0]}.png"
+    event = flight.see(DUPLICATE_PLACES[1], 0.9)
+    assert event.best.place.source_image == f"{DUPLICATE_PLACES[1]}.png"
+    assert event.ranking.slots[0] == event.track.slot == DUPLICATE_PLACES[1]
     assert event.ranking.scores[0] == pytest.approx(event.best.match.score)
     assert sorted(event.ranking.slots.tolist()) == sorted(set(event.ranking.slots.tolist()))
     assert event.track.confidence > 0.5
     if event.position:
-        assert event.position.lat_deg == pytest.approx(50 + TWICE[1] * 0.0002)
+        assert event.position.lat_deg == pytest.approx(50 + DUPLICATE_PLACES[1] * 0.0002)
 
 
 def test_tracked_hover_keeps_recognising_its_place(whole_map):
     """With the models that are shipped."""
     with PlaceMap.open(whole_map) as place_map:
         rule = make_accept_rule(TECHNIQUE, load_config(None).match)
-        hovering = Walk(place_map, rule)
+        hovering = TrackedWalk(place_map, rule)
         assert all(hovering.see(5, elapsed_s=1.0).accepted for _ in range(40))
-        creeping = Walk(place_map, rule)
+        creeping = TrackedWalk(place_map, rule)
         assert all(creeping.see(5 + look // 4, elapsed_s=0.5).accepted for look in range(40))
 
 
@@ -129,9 +129,9 @@ def test_tracked_flight_survives_blank_and_unusable_images(flight):
 
 
 def test_tracked_flight_accepts_no_unmapped_ground(whole_map):
-    rule = sure_rule(lambda evidence: 0.89 if evidence["agree"] > math.log(0.6) else 0.05)
+    rule = make_rule(lambda evidence: 0.89 if evidence["agree"] > math.log(0.6) else 0.05)
     with PlaceMap.open(whole_map) as place_map:
-        walk = Walk(place_map, rule)
+        walk = TrackedWalk(place_map, rule)
         assert [walk.see(place).accepted for place in range(1, 16, STRIDE)][-1]
         away = [walk.see(0, image=textured(900 + look)) for look in range(10)]
     assert not any(event.accepted for event in away)

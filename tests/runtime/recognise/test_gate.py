@@ -5,7 +5,7 @@ import numpy as np
 import pictures_of_nothing
 import pytest
 from pictures import textured
-from walks import map_of
+from walks import make_map
 
 from edgevpr.core.config import load_config
 from edgevpr.core.reasons import ReasonCode
@@ -29,7 +29,7 @@ def walk(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "m.gpkg"
     config, board = load_config(None, {"map": str(path), "source.camera": request.param}), load_board("this")
     frames = (frame(textured(number, 240, 320), f"{number}.png") for number in range(PLACES))
-    map_of(path, create("cohog", {"camera": request.param}), frames)
+    make_map(path, create("cohog", {"camera": request.param}), frames)
     recogniser = open_recogniser(config, board)
     with recogniser.place_map:
         yield recogniser
@@ -57,7 +57,7 @@ def test_step_accepts_no_image_of_an_unreal_scene(walk):
 def test_step_accepts_only_the_correct_place_for_a_mostly_hidden_image(walk):
     recognised = 0
     for number in (2, 5):
-        for kind, picture in pictures_of_nothing.spoilt(9000 + number, textured(number, 240, 320)):
+        for kind, picture in pictures_of_nothing.yield_spoilt(9000 + number, textured(number, 240, 320)):
             event = walk.step(frame(picture, kind))
             assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
             recognised += event.accepted

@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from pictures import from_height
-from walks import map_of, walk_over
+from pictures import view_at
+from walks import make_map, walk_over
 
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.level import Lens
@@ -21,21 +21,21 @@ PLACES = 4
 
 def frame(place, height_ratio=1.0):
     return Frame(
-        image=from_height(place, height_ratio), name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0)
+        image=view_at(place, height_ratio), name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0)
     )
 
 
 @pytest.fixture(scope="module")
-def opened(tmp_path_factory):
+def height_map(tmp_path_factory):
     technique = create("cohog", {"camera": "nadir"})
-    path = map_of(tmp_path_factory.mktemp("heights") / "m.gpkg", technique, map(frame, range(PLACES)))
+    path = make_map(tmp_path_factory.mktemp("heights") / "m.gpkg", technique, map(frame, range(PLACES)))
     with PlaceMap.open(path) as place_map:
         yield technique, place_map
 
 
-def recogniser(opened, monkeypatch, prior=None):
+def recogniser(height_map, monkeypatch, prior=None):
     """A recogniser, and the heights that its scans are asked to look from."""
-    technique, place_map = opened
+    technique, place_map = height_map
     heights, scan = [], type(technique).score_places
 
     def score_places(query, rows, mean, **hints):
@@ -46,8 +46,8 @@ def recogniser(opened, monkeypatch, prior=None):
     return walk_over(place_map, technique, prior=prior), heights
 
 
-def test_step_needs_one_pass_at_the_height_of_the_map(opened, monkeypatch):
-    walk, heights = recogniser(opened, monkeypatch)
+def test_step_needs_one_pass_at_the_height_of_the_map(height_map, monkeypatch):
+    walk, heights = recogniser(height_map, monkeypatch)
     event = walk.step(frame(2))
     assert event.accepted
     assert heights == [1.0]
@@ -55,8 +55,8 @@ def test_step_needs_one_pass_at_the_height_of_the_map(opened, monkeypatch):
 
 
 @pytest.mark.parametrize("height_ratio", [0.55, 2.0])
-def test_step_accepts_a_query_from_another_height_in_the_second_pass(opened, monkeypatch, height_ratio):
-    walk, heights = recogniser(opened, monkeypatch)
+def test_step_accepts_a_query_from_another_height_in_the_second_pass(height_map, monkeypatch, height_ratio):
+    walk, heights = recogniser(height_map, monkeypatch)
     event = walk.step(frame(1, height_ratio))
     assert heights == [1.0, 0.5, 0.7, 1.42, 2.0]
     assert event.accepted, event.reason
@@ -64,8 +64,8 @@ def test_step_accepts_a_query_from_another_height_in_the_second_pass(opened, mon
     assert event.best.match.height_ratio == pytest.approx(height_ratio, rel=0.05)
 
 
-def test_step_searches_the_next_query_at_the_last_height(opened, monkeypatch):
-    walk, heights = recogniser(opened, monkeypatch, Prior(None, None, is_live=False))
+def test_step_searches_the_next_query_at_the_last_height(height_map, monkeypatch):
+    walk, heights = recogniser(height_map, monkeypatch, Prior(None, None, is_live=False))
     first, second = (walk.step(frame(place, 2.0)) for place in (1, 3))
     assert (first.accepted, second.accepted) == (True, True)
     assert heights[:5] == [1.0, 0.5, 0.7, 1.42, 2.0]
@@ -73,8 +73,8 @@ def test_step_searches_the_next_query_at_the_last_height(opened, monkeypatch):
     assert second.view.zoom == pytest.approx(first.best.match.height_ratio / 2.0)
 
 
-def test_step_accepts_no_unmapped_ground_at_any_height(opened, monkeypatch):
-    walk, _ = recogniser(opened, monkeypatch)
+def test_step_accepts_no_unmapped_ground_at_any_height(height_map, monkeypatch):
+    walk, _ = recogniser(height_map, monkeypatch)
     for height_ratio in (0.5, 1.0, 2.0):
         event = walk.step(frame(17, height_ratio))
         assert not event.failed
@@ -82,20 +82,20 @@ def test_step_accepts_no_unmapped_ground_at_any_height(opened, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def cut_twice(tmp_path_factory):
+def two_footprint_map(tmp_path_factory):
     """A map of places that were cut at two footprints, 100 m and 150 m."""
     technique, frames = create("cohog", {"camera": "nadir"}), []
     for ratio in (1.0, 1.5):
         pose = Pose(up_deg=0.0, footprint_m=100 * ratio, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
         frames += [replace(frame(place, ratio), name=f"{place} {ratio}", pose=pose) for place in range(PLACES)]
-    with PlaceMap.open(map_of(tmp_path_factory.mktemp("layers") / "m.gpkg", technique, frames)) as place_map:
+    with PlaceMap.open(make_map(tmp_path_factory.mktemp("layers") / "m.gpkg", technique, frames)) as place_map:
         yield technique, place_map
 
 
 @pytest.mark.parametrize("height_m", [None, 100.0])
-def test_step_searches_the_places_whose_footprint_fits_the_height(cut_twice, height_m):
+def test_step_searches_the_places_whose_footprint_fits_the_height(two_footprint_map, height_m):
     """By the height, where it is told, from the first picture on; else by the last match."""
-    technique, place_map = cut_twice
+    technique, place_map = two_footprint_map
     scan, looked = type(technique).score_places, []
 
     class Noting(type(technique)):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sureness import NEEDED, Told, agreed, bare_index, sure_rule, told
+from sureness import NEEDED, FixedModel, agreeing, make_bare_index, make_model, make_rule
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch
@@ -32,27 +32,27 @@ from edgevpr.techniques import create
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
 
 
-def judged(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
+def decide(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
     """The verdict on a best place and places elsewhere with these scores; `more` is known of the best."""
     slots = np.array([0, 10, 20])[: len(scores)]
     compared = dict(zip(slots.tolist(), matches or map(FineMatch, scores), strict=True))
     ranking = Ranking(slots=slots, scores=np.array(scores, np.float32), compared=compared)
-    return judge(Findings(ranking, **more), bare_index(30), rule)
+    return judge(Findings(ranking, **more), make_bare_index(30), rule)
 
 
 CLEAR = Evidence(agree=-1.6, lead=0.7, coverage=-0.5)
-DOUBTED = Located(position=Position(47.0, 8.0), covariance_m2=(1.0, 0.0, 1.0), objection=Reason(ReasonCode.LOW_TEXTURE))
+INVALID = Located(position=Position(47.0, 8.0), covariance_m2=(1.0, 0.0, 1.0), objection=Reason(ReasonCode.LOW_TEXTURE))
 
 
 @pytest.mark.parametrize(("confidence", "accepted"), [(1.0, True), (NEEDED, True), (0.8999, False), (math.nan, False)])
 def test_judge_accepts_a_match_from_the_required_confidence(confidence, accepted):
-    rule = sure_rule(lambda evidence: confidence)
-    verdict = judged(rule=rule, evidence=CLEAR)
+    rule = make_rule(lambda evidence: confidence)
+    verdict = decide(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
     assert verdict.reason.code is (ReasonCode.ACCEPTED_BY_CONFIDENCE if accepted else ReasonCode.LOW_CONFIDENCE)
     figures = {"confidence": confidence, "min_confidence": 0.9, "regions_ratio": math.exp(CLEAR.lead)}
     assert {name: verdict.reason.parameters[name] for name in figures} == pytest.approx(figures, nan_ok=True)
-    assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
+    assert decide((0.2,), make_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
         "no place elsewhere"
     )
 
@@ -62,24 +62,24 @@ def test_judge_accepts_a_match_from_the_required_confidence(confidence, accepted
     [(0.3, 0.5, 0.7, True), (NEEDED, 0.99, 0.7, False), (0.3, 0.49, 0.7, False), (0.3, 0.99, 0.0, False)],
 )
 def test_judge_requests_more_evidence_only_if_it_can_decide(confidence, of_map, lead, is_undecided):
-    rule = told(lambda evidence: confidence, lambda evidence: of_map)
+    rule = make_model(lambda evidence: confidence, lambda evidence: of_map)
     assert rule.is_undecided(replace(CLEAR, lead=lead)) == is_undecided
 
 
 def test_cap_confidence_shows_no_more_than_the_data_support():
-    rule = ConfidenceRule(dict.fromkeys(MAP_FIGURES, Told(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
+    rule = ConfidenceRule(dict.fromkeys(MAP_FIGURES, FixedModel(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
     assert (rule.confidence(CLEAR), rule.cap_confidence(CLEAR)) == (1.0, 0.9998)
     down = make_accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).confidence_rule
     assert down.cap_confidence(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
 
 
 def test_judge_requires_landmarks_or_track_for_weak_forward_regions():
-    rule = sure_rule(lambda evidence: 1.0, needed=0.9999)
+    rule = make_rule(lambda evidence: 1.0, needed=0.9999)
     hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3)
     assert rule.confidence_rule.confidence(hardly) == 0.9
-    assert not judged(rule=rule, evidence=hardly).accepted
-    assert judged(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
-    assert judged(rule=rule, evidence=hardly, track_confidence=0.9999).accepted
+    assert not decide(rule=rule, evidence=hardly).accepted
+    assert decide(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
+    assert decide(rule=rule, evidence=hardly, track_confidence=0.9999).accepted
     twin = replace(hardly, landmarks=log_count(30), twin=0.1)
     assert rule.confidence_rule.confidence(twin) == 0.5
 
@@ -97,21 +97,21 @@ def test_judge_requires_landmarks_or_track_for_weak_forward_regions():
     ],
 )
 def test_judge_requires_only_the_precision_if_the_track_makes_the_place_much_likelier(confidence, followed, accepted):
-    rule = sure_rule(lambda evidence: confidence, needed=0.9999)
-    assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted == accepted
-    assert judged(rule=rule, evidence=CLEAR).accepted is (confidence == 1.0)
+    rule = make_rule(lambda evidence: confidence, needed=0.9999)
+    assert decide(rule=rule, evidence=CLEAR, track_confidence=followed).accepted == accepted
+    assert decide(rule=rule, evidence=CLEAR).accepted is (confidence == 1.0)
 
 
 @pytest.mark.parametrize(("followed", "accepted"), [(0.99, True), (0.9899, False)])
 def test_judge_requires_a_certain_track_if_the_track_decides(followed, accepted):
-    rule = sure_rule(lambda evidence: 0.5)
+    rule = make_rule(lambda evidence: 0.5)
     rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))
-    assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted is accepted
+    assert decide(rule=rule, evidence=CLEAR, track_confidence=followed).accepted is accepted
 
 
 @pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.ROTATION_AMBIGUOUS)])
 def test_judge_requires_a_lead_over_the_image_at_another_rotation(lead, code):
-    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_other_rotation=lead)
+    verdict = decide(rule=make_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_other_rotation=lead)
     assert verdict.reason.code is (code or ReasonCode.ACCEPTED_BY_CONFIDENCE)
 
 
@@ -120,11 +120,11 @@ def test_judge_requires_a_lead_over_the_image_at_another_rotation(lead, code):
     [
         ({"tilt": ObservedTilt(math.tan(math.radians(60.1)), 0.0)}, ReasonCode.TILT_SHOWN),
         ({"tilt": ObservedTilt(math.tan(math.radians(59.9)), 0.0)}, ReasonCode.ACCEPTED_BY_SCORE),
-        ({"located": DOUBTED}, ReasonCode.LOW_TEXTURE),
+        ({"located": INVALID}, ReasonCode.LOW_TEXTURE),
     ],
 )
 def test_judge_refuses_a_match_for_its_tilt_and_its_position(known, code):
-    verdict = judged(**known)
+    verdict = decide(**known)
     assert verdict.reason.code is code
     assert verdict.accepted is (code is ReasonCode.ACCEPTED_BY_SCORE)
 
@@ -142,7 +142,7 @@ def test_judge_refuses_a_match_for_its_tilt_and_its_position(known, code):
     ],
 )
 def test_judge_accepts_values_equal_to_the_limits(scores, limits, code):
-    verdict = judged(scores, replace(RULE, **limits))
+    verdict = decide(scores, replace(RULE, **limits))
     assert verdict.reason.code is code
     assert verdict.accepted is code.name.startswith("ACCEPTED")
 
@@ -155,33 +155,33 @@ def test_check_texture_accepts_an_image_of_sufficient_quality(quality, needed):
 
 def test_judge_accepts_the_place_of_the_track_over_the_best_score():
     rule = make_accept_rule(create("cohog"), load_config(None, {}).match)
-    rule = replace(rule, confidence_rule=told(lambda evidence: 0.5))
-    assert judged((0.19, 0.2), rule, evidence=CLEAR, track_confidence=0.9999).accepted
-    assert not judged((0.19, 0.2), rule, evidence=CLEAR).accepted
-    assert not judged((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, track_confidence=0.9999).accepted
+    rule = replace(rule, confidence_rule=make_model(lambda evidence: 0.5))
+    assert decide((0.19, 0.2), rule, evidence=CLEAR, track_confidence=0.9999).accepted
+    assert not decide((0.19, 0.2), rule, evidence=CLEAR).accepted
+    assert not decide((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, track_confidence=0.9999).accepted
 
 
 @pytest.mark.parametrize(("lead", "accepted"), [(0.0, True), (-0.01, False)])
 def test_judge_refuses_by_track_alone_what_another_place_beats_in_the_image(lead, accepted):
-    rule = sure_rule(lambda evidence: 0.5)
-    verdict = judged(rule=rule, evidence=replace(CLEAR, lead=lead), track_confidence=0.9999)
+    rule = make_rule(lambda evidence: 0.5)
+    verdict = decide(rule=rule, evidence=replace(CLEAR, lead=lead), track_confidence=0.9999)
     assert verdict.accepted is accepted
     assert (verdict.reason.code is ReasonCode.ELSEWHERE_AGREES_BETTER) is not accepted
 
 
 def test_judge_refuses_a_match_without_evidence():
-    assert not judged(rule=sure_rule(lambda evidence: 1.0)).accepted
+    assert not decide(rule=make_rule(lambda evidence: 1.0)).accepted
 
 
 @pytest.mark.parametrize("limit", [{"min_score": 0.21}, {"min_margin": 0.11}, {"min_verify_score": 0.21}])
 def test_judge_applies_limits_in_addition_to_the_confidence(limit):
-    assert judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR).accepted
-    assert not judged(rule=sure_rule(lambda evidence: 1.0, **limit), evidence=CLEAR).accepted
+    assert decide(rule=make_rule(lambda evidence: 1.0), evidence=CLEAR).accepted
+    assert not decide(rule=make_rule(lambda evidence: 1.0, **limit), evidence=CLEAR).accepted
 
 
 @pytest.mark.parametrize("score", [math.nan, 0.019])
 def test_judge_does_not_compensate_low_confidence_with_a_high_score(score):
-    assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, min_verify_score=0.02), evidence=CLEAR).accepted
+    assert not decide((score, 0.0), make_rule(lambda evidence: 1.0, min_verify_score=0.02), evidence=CLEAR).accepted
 
 
 @pytest.mark.parametrize("kind", [DOWN, DOWN_BARE])
@@ -207,7 +207,7 @@ def test_make_accept_rule_uses_limits_for_sequences_and_techniques_without_evide
 def test_judge_refuses_a_sequence_whose_newest_query_was_not_compared_with_the_place():
     search = SimpleNamespace(frames=2, length=2)
     ranking = Ranking(slots=np.array([0, 10]), scores=np.array([0.2, 0.1], np.float32), compared={10: FineMatch(0.1)})
-    verdict = judge(Findings(ranking), bare_index(30), RULE, search)
+    verdict = judge(Findings(ranking), make_bare_index(30), RULE, search)
     assert verdict.reason.code is ReasonCode.NEWEST_DISAGREES
 
 
@@ -217,14 +217,14 @@ def test_judge_requires_a_sequence_to_lead_over_other_speeds_by_half_the_margin(
     rivals[10] = rival
     search = SimpleNamespace(frames=2, length=2, rivals=rivals, is_continued=lambda near, least: True)
     ranking = Ranking(slots=np.array([20, 10]), scores=np.array([0.5, 0.0], np.float32), compared={})
-    verdict = judge(Findings(ranking), bare_index(30), replace(RULE, min_margin=0.5), search)
+    verdict = judge(Findings(ranking), make_bare_index(30), replace(RULE, min_margin=0.5), search)
     assert verdict.accepted is accepted
     assert accepted or verdict.reason.code is ReasonCode.LOW_MARGIN_AT_OTHER_SPEED
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (0.4, True), (4 / 9, False)])
 def test_judge_refuses_unshifted_matches_of_other_places_as_an_overlay(share, accepted):
-    verdict = judged(unshifted_fraction=share)
+    verdict = decide(unshifted_fraction=share)
     assert verdict.accepted is accepted
     assert (verdict.reason.code is ReasonCode.ELSEWHERE_AT_REST) is not accepted
 
@@ -253,41 +253,41 @@ def test_is_unshifted_requires_no_shift_rotation_or_height_change(shift_cells, r
 def test_judge_requires_landmarks_against_a_place_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
     evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
-    verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), agreement=agreed(inliers), evidence=evidence)
+    verdict = decide((0.15, 0.14), make_rule(lambda evidence: 1.0), agreement=agreeing(inliers), evidence=evidence)
     assert verdict.accepted is accepted
     parameters = verdict.reason.parameters
     assert (parameters["landmarks"], parameters["rival_landmarks"]) == (inliers, rival)
     if not accepted:
         assert parameters["confidence"] == 0.5
-        by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, track_confidence=0.999)
+        by_flight = decide((0.15, 0.14), make_rule(lambda evidence: 1.0), evidence=evidence, track_confidence=0.999)
         assert by_flight.accepted, "the flight knows which of the two it is"
 
 
 @pytest.mark.parametrize(
     ("score", "proof", "accepted"),
     [
-        (0.3, agreed(4), False),
-        (0.3, agreed(0), False),
-        (0.3, agreed(5), True),
-        (0.3, agreed(0, possible=99), True),
-        (0.3, agreed(0, possible=100), False),
-        (0.19, agreed(0), True),
-        (0.12, agreed(30, is_expected=False), False),
+        (0.3, agreeing(4), False),
+        (0.3, agreeing(0), False),
+        (0.3, agreeing(5), True),
+        (0.3, agreeing(0, possible=99), True),
+        (0.3, agreeing(0, possible=100), False),
+        (0.19, agreeing(0), True),
+        (0.12, agreeing(30, is_expected=False), False),
     ],
 )
 def test_judge_refuses_a_clear_vote_without_agreeing_landmarks(score, proof, accepted):
-    assert judged((score, score - 0.1), agreement=proof).accepted == accepted
+    assert decide((score, score - 0.1), agreement=proof).accepted == accepted
 
 
 PLACES = 80
 LENGTH = 6
-RULE_OF_SEQUENCE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
+SEQUENCE_RULE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
 
 
-def flown(velocity, start, leaves=18, seed=3):
+def fly_sequence(velocity, start, leaves=18, seed=3):
     """(accepted, code, slot) of each query of a flight along places that look a little like the two around them; from
     query `leaves` on it shows nothing of the map."""
-    index = bare_index(PLACES)
+    index = make_bare_index(PLACES)
     index.place_ids[:] = np.arange(PLACES)
     noise = np.random.default_rng(seed)
     sequence, found = SequenceSearch(LENGTH), []
@@ -298,14 +298,14 @@ def flown(velocity, start, leaves=18, seed=3):
         slots = np.argsort(-scores)
         ranking = Ranking(slots=slots, scores=scores[slots], compared={})
         ranking = sequence.add_query(ranking, index, float(query))
-        verdict = judge(Findings(ranking), index, RULE_OF_SEQUENCE, sequence)
+        verdict = judge(Findings(ranking), index, SEQUENCE_RULE, sequence)
         found.append((verdict.accepted, verdict.reason.code, int(ranking.slots[0])))
     return found
 
 
 @pytest.mark.parametrize("velocity", [0.8, 1.2])
 def test_sequence_of_the_mapping_flight_is_accepted_from_the_first_complete_one(velocity):
-    found = flown(velocity, 5)
+    found = fly_sequence(velocity, 5)
     assert [yes for yes, _, _ in found] == [False] * (LENGTH - 1) + [True] * (18 - LENGTH + 1)
     assert all(abs(slot - (5 + velocity * query)) <= 1 for query, (yes, _, slot) in enumerate(found) if yes)
     assert found[3][1] is ReasonCode.SEQUENCE_INCOMPLETE
@@ -313,13 +313,13 @@ def test_sequence_of_the_mapping_flight_is_accepted_from_the_first_complete_one(
 
 @pytest.mark.parametrize(("velocity", "start"), [(2.0, 5), (3.0, 5), (0.0, 30), (0.3, 30), (-1.0, 60), (-2.0, 60)])
 def test_sequence_at_another_speed_or_direction_is_never_accepted_wrongly(velocity, start):
-    for query, (yes, _, slot) in enumerate(flown(velocity, start)):
+    for query, (yes, _, slot) in enumerate(fly_sequence(velocity, start)):
         assert not yes or abs(slot - (start + velocity * query)) <= 2  # neighbours are no other place
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_sequence_ends_where_the_aircraft_leaves_the_mapped_route(seed):
-    found = flown(1.0, 5, leaves=11, seed=seed)
+    found = fly_sequence(1.0, 5, leaves=11, seed=seed)
     assert found[10][0]
     # The mean would bear it for some queries yet: it is far ahead of all other places.
     assert not any(yes for yes, _, _ in found[13:])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fakes import vehicle_at
 from pictures import rough_ground
-from walks import map_of, walk_over
+from walks import make_map, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
@@ -32,7 +32,7 @@ FOOTPRINT_M = HEIGHT_M * 640 / CAMERA.focal_px
 LAYER = Layers(FOOTPRINT_M, (FOOTPRINT_M,), np.zeros(0, int), np.zeros(0, int))
 NORTH_M = (120.0, 240.0, 360.0, 480.0)
 M_PER_DEG = 111_195.0
-STRAIGHT = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
+LEVEL_POSE = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def ground():
 
 def frame(ground, place, t_mono_s=0.0, told=None, **pose):
     """The picture of a place, the middle of it in the middle, and what is told of it (None: the truth)."""
-    pose = STRAIGHT | pose
+    pose = LEVEL_POSE | pose
     heading, pitch = math.radians(pose["heading_deg"]), math.radians(pose["pitch_deg"])
     ahead_m = math.tan(pitch) * pose["height_m"]
     where = CameraPose(
@@ -68,7 +68,7 @@ def place_map(ground, technique, tmp_path_factory):
     poses = ({"heading_deg": 90.0}, {"pitch_deg": 8.0}, {"heading_deg": 200.0, "pitch_deg": -6.0}, {})
     frames = [frame(ground, place, **pose) for place, pose in enumerate(poses)]
     levelling = Levelling(LENS, below=True, is_live=False)
-    with PlaceMap.open(map_of(path, technique, frames, levelling=levelling)) as opened:
+    with PlaceMap.open(make_map(path, technique, frames, levelling=levelling)) as opened:
         yield opened
 
 
@@ -81,22 +81,22 @@ def walk(place_map, technique):
     return of
 
 
-def scaling(is_live=False):
+def make_scaling(is_live=False):
     return Levelling(LENS, is_live=is_live)
 
 
-def recognised(event, place):
+def is_recognised(event, place):
     return event.accepted and event.best.place.source_image == f"{place}"
 
 
-HARD = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
+DIFFICULT_POSE = {"heading_deg": 130.0, "pitch_deg": 20.0, "height_m": 45.0}
 
 
 @pytest.mark.slow
 def test_step_finds_the_place_from_another_height_heading_and_tilt(walk, ground):
-    as_it_is = walk(None).step(frame(ground, 1, **HARD))
-    event = walk(scaling()).step(frame(ground, 1, **HARD))
-    assert recognised(event, 1)
+    as_it_is = walk(None).step(frame(ground, 1, **DIFFICULT_POSE))
+    event = walk(make_scaling()).step(frame(ground, 1, **DIFFICULT_POSE))
+    assert is_recognised(event, 1)
     assert event.best.match.score > as_it_is.best.match.score
     assert event.view.up_deg == 0.0
     assert event.view.footprint_m == pytest.approx(FOOTPRINT_M)
@@ -115,17 +115,17 @@ def test_step_finds_the_place_from_another_height_heading_and_tilt(walk, ground)
     ],
 )
 def test_step_finds_a_level_image_whatever_attitude_is_reported(walk, ground, wrong):
-    event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | wrong))
+    event = walk(make_scaling()).step(frame(ground, 2, told=LEVEL_POSE | wrong))
     assert not event.failed
-    assert recognised(event, 2)
+    assert is_recognised(event, 2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pitch_deg", [30.0, 45.0, 52.0])
 def test_step_locates_the_aircraft_from_a_steep_image_of_known_angles(walk, ground, pitch_deg):
     steep = frame(ground, 2, pitch_deg=pitch_deg)
-    event = walk(scaling()).step(steep)
-    assert recognised(event, 2)
+    event = walk(make_scaling()).step(steep)
+    assert is_recognised(event, 2)
     found = event.located.position
     assert math.hypot(*offset_m(steep.position.lat_deg, 8.0, found.lat_deg, found.lon_deg)) < 5.0
 
@@ -137,16 +137,16 @@ def test_prepare_warps_the_mask_with_the_image(walk, ground):
     image[:120, :160] = np.random.default_rng(1).integers(0, 256, (120, 160, 3))
     allowed = np.ones(image.shape[:2], bool)
     allowed[:124, :164] = False
-    asked = walk(scaling(), mask=OverlayMask(allowed, ""))
+    asked = walk(make_scaling(), mask=OverlayMask(allowed, ""))
     covered, clean = asked.step(replace(seen, image=image)), asked.step(seen)
     assert np.array_equal(covered.descriptor.fine, clean.descriptor.fine)
-    assert recognised(covered, 1)
+    assert is_recognised(covered, 1)
 
 
 @pytest.mark.slow
 def test_prepare_refuses_too_large_a_tilt_and_reports_it_once(walk, ground, caplog):
-    asked = walk(scaling())
-    steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 65.0})
+    asked = walk(make_scaling())
+    steep = frame(ground, 1, told=LEVEL_POSE | {"roll_deg": 65.0})
     with caplog.at_level(logging.WARNING):
         events = [asked.step(steep) for _ in range(3)]
     reasons = [event.view.reason for event in events]
@@ -244,7 +244,7 @@ def test_prepare_applies_the_configured_mount_with_and_without_lens_or_gimbal(te
 @pytest.mark.slow
 @pytest.mark.parametrize("heading_deg", [0.0, 130.0])
 def test_step_locates_a_tilted_camera_correctly_only_with_its_mount(walk, ground, heading_deg):
-    seen = frame(ground, 1, heading_deg=heading_deg, pitch_deg=9.0, told=STRAIGHT | {"heading_deg": heading_deg})
+    seen = frame(ground, 1, heading_deg=heading_deg, pitch_deg=9.0, told=LEVEL_POSE | {"heading_deg": heading_deg})
     ahead_m = HEIGHT_M * math.tan(math.radians(9))
     turn = math.radians(heading_deg)
     true_m = np.array([-ahead_m * math.sin(turn), NORTH_M[1] - ahead_m * math.cos(turn)])
@@ -253,7 +253,7 @@ def test_step_locates_a_tilted_camera_correctly_only_with_its_mount(walk, ground
     for mount in (Mount(9.0), STRAIGHT_DOWN, Mount(9.0)):
         recogniser.change(mount=mount)
         event = recogniser.step(seen)
-        assert recognised(event, 1)
+        assert is_recognised(event, 1)
         at = event.located.position
         wrong_m.append(math.dist(offset_m(50.0, 8.0, at.lat_deg, at.lon_deg), true_m))
     assert max(wrong_m[0], wrong_m[2]) < 2.5
@@ -266,8 +266,8 @@ def test_step_locates_a_tilted_camera_correctly_only_with_its_mount(walk, ground
     [(12.0, None), (20.0, None), (40.0, None), (60.0, None), (20.0, 0.0), (40.0, 0.0), (60.0, 0.0)],
 )
 def test_step_claims_an_unreported_tilt(walk, ground, pitch_deg, reported_deg):
-    told = STRAIGHT | {"roll_deg": reported_deg, "pitch_deg": reported_deg}
-    event = walk(scaling()).step(frame(ground, 1, pitch_deg=pitch_deg, told=told))
+    told = LEVEL_POSE | {"roll_deg": reported_deg, "pitch_deg": reported_deg}
+    event = walk(make_scaling()).step(frame(ground, 1, pitch_deg=pitch_deg, told=told))
     ahead_m = HEIGHT_M * math.tan(math.radians(pitch_deg))
     assert event.accepted or pitch_deg > 12
     assert not event.accepted or event.accuracy_m > min(40.0, ahead_m / 2)
@@ -275,8 +275,8 @@ def test_step_claims_an_unreported_tilt(walk, ground, pitch_deg, reported_deg):
 
 @pytest.mark.slow
 def test_step_needs_no_attitude_for_a_level_image(walk, ground):
-    event = walk(scaling()).step(frame(ground, 1, told=STRAIGHT | {"roll_deg": None, "pitch_deg": None}))
-    assert recognised(event, 1)
+    event = walk(make_scaling()).step(frame(ground, 1, told=LEVEL_POSE | {"roll_deg": None, "pitch_deg": None}))
+    assert is_recognised(event, 1)
     assert event.accuracy_m < 10
 
 
@@ -284,11 +284,11 @@ def test_step_needs_no_attitude_for_a_level_image(walk, ground):
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_step_corrects_a_wrong_recorded_height_after_the_first_match(walk, ground, factor):
     prior = RecordedPrior(("height",))
-    recogniser = walk(scaling(), prior)
-    told = STRAIGHT | {"height_m": factor * HEIGHT_M}
+    recogniser = walk(make_scaling(), prior)
+    told = LEVEL_POSE | {"height_m": factor * HEIGHT_M}
     first, second = (recogniser.step(frame(ground, place, told=told)) for place in (3, 2))
-    assert recognised(first, 3)
-    assert recognised(second, 2)
+    assert is_recognised(first, 3)
+    assert is_recognised(second, 2)
     assert second.view.footprint_m == pytest.approx(FOOTPRINT_M, rel=0.05)
     assert prior.searches_heights, "until three matches agree"
 
@@ -297,13 +297,13 @@ def test_step_corrects_a_wrong_recorded_height_after_the_first_match(walk, groun
 def test_step_corrects_a_wrong_reported_height_after_the_first_match(walk, ground, technique, lens):
     levelling = Levelling(lens, is_live=False)
     follow = walk(levelling, Prior(None, technique.spec.heading_within_deg, is_live=False))
-    told = STRAIGHT | {"height_m": 1.25 * HEIGHT_M}
+    told = LEVEL_POSE | {"height_m": 1.25 * HEIGHT_M}
     first, second = (
         follow.step(frame(ground, place, told=told, height_m=1.25 * HEIGHT_M if lens is None else HEIGHT_M))
         for place in (3, 2)
     )
-    assert recognised(first, 3)
-    assert recognised(second, 2)
+    assert is_recognised(first, 3)
+    assert is_recognised(second, 2)
     shown = 1.25 if lens is None else 0.8
     assert first.best.match.height_ratio == pytest.approx(shown, rel=0.04)
     assert second.best.match.height_ratio == pytest.approx(1.0 if lens else 1.42, rel=0.04)
@@ -329,6 +329,6 @@ def test_enlarge_image_scales_around_the_centre(zoom):
 
 @pytest.mark.slow
 def test_the_accuracy_in_the_world_contains_an_error_of_the_reported_tilt(walk, ground):
-    event = walk(scaling()).step(frame(ground, 1, told=STRAIGHT))
-    assert recognised(event, 1)
+    event = walk(make_scaling()).step(frame(ground, 1, told=LEVEL_POSE))
+    assert is_recognised(event, 1)
     assert event.accuracy_m == pytest.approx(math.hypot(event.located.accuracy_m, 0.01746 * HEIGHT_M), rel=0.05)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sureness import agreed
+from sureness import agreeing
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_position, project_to_metres
@@ -26,7 +26,7 @@ def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, t
     return Candidate(place, match)
 
 
-def off_m(position):
+def measure_offset_m(position):
     east_m, north_m = project_to_metres(
         np.array([ORIGIN.lat_deg, position.lat_deg]), np.array([ORIGIN.lon_deg, position.lon_deg])
     )
@@ -47,7 +47,7 @@ def off_m(position):
 )
 def test_locate_converts_a_shift_in_the_image_to_the_ground(shift, up_deg, there):
     found = locate([candidate(shift=shift, up_deg=up_deg)], CELLS, View(nadir_offset=(0.0, 0.0)))
-    assert off_m(found.position) == pytest.approx(there, abs=0.01)
+    assert measure_offset_m(found.position) == pytest.approx(there, abs=0.01)
     assert found.position.alt_m == ORIGIN.alt_m
 
 
@@ -68,23 +68,23 @@ def test_locate_adds_the_rotation_to_the_heading_of_the_place(up_deg, turned_deg
 )
 def test_locate_gives_the_position_of_the_aircraft_not_of_the_image_centre(turned_deg, nadir_offset, there):
     found = locate([candidate(turned_deg=turned_deg)], CELLS, View(nadir_offset=nadir_offset))
-    assert off_m(found.position) == pytest.approx(there, abs=0.01)
+    assert measure_offset_m(found.position) == pytest.approx(there, abs=0.01)
 
 
 def test_locate_scales_the_nadir_offset_with_the_height():
-    proof = agreed(20, (0.0, 0.0), scale=2.0)
+    proof = agreeing(20, (0.0, 0.0), scale=2.0)
     found = locate([candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
-    assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
+    assert measure_offset_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_locate_prefers_landmarks_to_the_vote():
-    proof = agreed(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
+    proof = agreeing(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
     by_vote = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)))
     found = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says
-    assert off_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.5)
-    assert math.dist(off_m(found.position), between) > 0.5
+    assert measure_offset_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.5)
+    assert math.dist(measure_offset_m(found.position), between) > 0.5
     assert found.heading_deg == pytest.approx(4.0)
     assert found.places == (1,)
     assert found.accuracy_m < by_vote.accuracy_m
@@ -93,7 +93,7 @@ def test_locate_prefers_landmarks_to_the_vote():
 def test_locate_averages_places_of_the_same_ground():
     one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
     found = locate([one, other], CELLS, View(nadir_offset=(0.0, 0.0)))
-    assert off_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
+    assert measure_offset_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
     assert found.places == (1, 2)
     assert found.accuracy_m < locate([one], CELLS, View(nadir_offset=(0.0, 0.0))).accuracy_m
     assert found.accuracy_m >= 2.0, "what is wrong with the map does not become less by hearing more of it"
@@ -110,7 +110,7 @@ def test_locate_skips_a_slightly_inconsistent_place_without_objection():
     found = locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.places == (1,)
     assert found.objection is None
-    assert off_m(found.position) == pytest.approx((8, 0), abs=0.01)
+    assert measure_offset_m(found.position) == pytest.approx((8, 0), abs=0.01)
 
 
 @pytest.mark.parametrize(

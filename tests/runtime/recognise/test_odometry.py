@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from levelled_views import lit_ground, view_from
+from levelled_views import light_ground, take_level_view
 
 from edgevpr.frames.level import UNKNOWN_VIEW
 from edgevpr.lab.simulate.camera import CameraPose
@@ -18,16 +18,16 @@ START = CameraPose(east_m=200.0, north_m=200.0, height_m=100.0, heading_deg=30.0
 
 @pytest.fixture(scope="module")
 def ground():
-    return lit_ground(400.0, 400.0)
+    return light_ground(400.0, 400.0)
 
 
-def seen(ground, pose, told=None):
+def take_view(ground, pose, told=None):
     """The view from a pose, and its landmarks; `told` is the pose that the autopilot reports."""
-    picture = view_from(ground, pose, told)
+    picture = take_level_view(ground, pose, told)
     return picture.view, detect_landmarks(picture.image, picture.mask, QUERY_LANDMARKS)
 
 
-def stride(first, second, after_s=1.0):
+def measure_odometry(first, second, after_s=1.0):
     strides = VisualOdometry()
     assert strides.measure(5.0, *first) is None
     return strides.measure(5.0 + after_s, *second)
@@ -45,7 +45,7 @@ def stride(first, second, after_s=1.0):
 )
 def test_odometry_measures_the_displacement_of_the_aircraft(ground, change):
     second = replace(START, **change)
-    found = stride(seen(ground, START), seen(ground, second))
+    found = measure_odometry(take_view(ground, START), take_view(ground, second))
     gone_m = second.east_m - START.east_m, second.north_m - START.north_m
     assert found.moved_m == pytest.approx(gone_m, abs=0.5)
     assert (found.from_s, found.to_s) == (5.0, 6.0)
@@ -55,27 +55,27 @@ def test_odometry_measures_the_displacement_of_the_aircraft(ground, change):
 def test_odometry_is_scaled_by_a_wrong_height_and_rotated_by_a_wrong_compass(ground):
     second = replace(START, east_m=230.0)
     low, turned = ({"height_m": 90.0}, {"heading_deg": 40.0})
-    pair = [seen(ground, pose, replace(pose, **low)) for pose in (START, second)]
-    assert stride(*pair).moved_m == pytest.approx((27.0, 0.0), abs=0.7)
-    pair = [seen(ground, pose, replace(pose, **turned)) for pose in (START, second)]
-    east, north = stride(*pair).moved_m
+    pair = [take_view(ground, pose, replace(pose, **low)) for pose in (START, second)]
+    assert measure_odometry(*pair).moved_m == pytest.approx((27.0, 0.0), abs=0.7)
+    pair = [take_view(ground, pose, replace(pose, **turned)) for pose in (START, second)]
+    east, north = measure_odometry(*pair).moved_m
     assert math.degrees(math.atan2(-north, east)) == pytest.approx(10.0, abs=1.0)
 
 
 def test_odometry_is_none_if_it_cannot_be_measured(ground):
-    first, second = seen(ground, START), seen(ground, replace(START, east_m=215.0))
-    elsewhere = seen(ground, replace(START, east_m=60.0, north_m=330.0))
-    assert stride(first, elsewhere) is None
-    assert stride(first, second, after_s=40.0) is None
-    assert stride(first, second, after_s=0.0) is None
-    assert stride(first, (UNKNOWN_VIEW, second[1])) is None
-    assert stride(first, (replace(second[0], footprint_m=None), second[1])) is None
+    first, second = take_view(ground, START), take_view(ground, replace(START, east_m=215.0))
+    elsewhere = take_view(ground, replace(START, east_m=60.0, north_m=330.0))
+    assert measure_odometry(first, elsewhere) is None
+    assert measure_odometry(first, second, after_s=40.0) is None
+    assert measure_odometry(first, second, after_s=0.0) is None
+    assert measure_odometry(first, (UNKNOWN_VIEW, second[1])) is None
+    assert measure_odometry(first, (replace(second[0], footprint_m=None), second[1])) is None
 
 
 def test_odometry_rejects_jumps_of_compass_and_height(ground):
     second = replace(START, east_m=215.0)
     for wrong in ({"heading_deg": 50.0}, {"height_m": 70.0}):
-        assert stride(seen(ground, START), seen(ground, second, replace(second, **wrong))) is None
+        assert measure_odometry(take_view(ground, START), take_view(ground, second, replace(second, **wrong))) is None
 
 
 def test_odometry_is_none_over_repetitive_or_featureless_ground():
@@ -84,7 +84,7 @@ def test_odometry_is_none_over_repetitive_or_featureless_ground():
     tile = cv2.normalize(tile, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     repeated = np.repeat(np.tile(tile, (40, 40))[..., None], 3, 2)
     second = replace(START, east_m=217.0)
-    found = stride(seen(repeated, START), seen(repeated, second))
+    found = measure_odometry(take_view(repeated, START), take_view(repeated, second))
     assert found is None or found.moved_m == pytest.approx((17.0, 0.0), abs=0.5)
     blank = np.full((1600, 1600, 3), 90, np.uint8)
-    assert stride(seen(blank, START), seen(blank, second)) is None
+    assert measure_odometry(take_view(blank, START), take_view(blank, second)) is None

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from levelled_views import lit_ground, view_from
+from levelled_views import light_ground, take_level_view
 from scipy.spatial.transform import Rotation
 
 from edgevpr.core.contract import Perspective
@@ -85,18 +85,18 @@ def test_fit_attitude_error_needs_enough_landmarks_off_a_line():
 
 @pytest.fixture(scope="module")
 def ground():
-    return lit_ground(320.0, 280.0)
+    return light_ground(320.0, 280.0)
 
 
 @pytest.mark.parametrize(
     ("roll_deg", "pitch_deg", "told_roll_deg"), [(3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (15.0, 2.0, 13.0)]
 )
 def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_deg, pitch_deg, told_roll_deg):
-    place = view_from(ground, CameraPose(east_m=160.0, north_m=140.0, height_m=100.0, heading_deg=0.0))
+    place = take_level_view(ground, CameraPose(east_m=160.0, north_m=140.0, height_m=100.0, heading_deg=0.0))
     pose = CameraPose(
         east_m=168.0, north_m=134.0, height_m=102.0, heading_deg=40.0, roll_deg=roll_deg, pitch_deg=pitch_deg
     )
-    query = view_from(ground, pose, replace(pose, roll_deg=told_roll_deg, pitch_deg=0.0))
+    query = take_level_view(ground, pose, replace(pose, roll_deg=told_roll_deg, pitch_deg=0.0))
     found = measure_agreement(
         detect_landmarks(query.image, query.mask, QUERY_LANDMARKS), detect_landmarks(place.image, place.mask)
     )
@@ -118,7 +118,7 @@ def test_convert_to_tilt_of_a_narrow_lens_goes_by_the_stretch(tilt_deg, is_clear
     assert tilt.deg == pytest.approx(tilt_deg if is_clear else 0.0, abs=0.1)
 
 
-def add_matches(tilt, slope_of_ground, seed=5, count=6, place_ids=None):
+def estimate_common_tilt(tilt, slope_of_ground, seed=5, count=6, place_ids=None):
     """Return the common tilt of matches whose camera leans by `tilt` in its own axes (right + down j, a tangent) over
     ground that slopes in a fixed direction; the nose points anywhere, and each perspective is somewhat wrong."""
     rng, common = np.random.default_rng(seed), CommonTilt()
@@ -134,16 +134,16 @@ def add_matches(tilt, slope_of_ground, seed=5, count=6, place_ids=None):
 
 
 def test_common_tilt_is_that_of_the_camera():
-    found = add_matches(0.3 - 0.2j, 0)
+    found = estimate_common_tilt(0.3 - 0.2j, 0)
     assert found.is_clear
     assert found.deg == pytest.approx(math.degrees(math.atan(math.hypot(0.3, 0.2))), abs=5)
 
 
 @pytest.mark.parametrize("slope_of_ground", [0, 0.1])
 def test_common_tilt_of_a_level_camera_is_not_clear(slope_of_ground):
-    assert not any(add_matches(0, slope_of_ground, seed, 12).is_clear for seed in range(20))
+    assert not any(estimate_common_tilt(0, slope_of_ground, seed, 12).is_clear for seed in range(20))
 
 
 def test_common_tilt_counts_a_place_once():
-    assert add_matches(0.15, 0, place_ids=[7] * 6).sd == add_matches(0.15, 0, count=1).sd
+    assert estimate_common_tilt(0.15, 0, place_ids=[7] * 6).sd == estimate_common_tilt(0.15, 0, count=1).sd
     assert not CommonTilt().mean.is_clear

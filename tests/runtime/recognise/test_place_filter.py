@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from fakes import vehicle_at
-from sureness import told
+from sureness import make_model
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position
@@ -24,17 +24,17 @@ SPACING_M = 20.0
 FOOTPRINT_M = 80.0
 STRIDE = 3  # places from look to look, at one a second: each look is of new ground
 SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
-NOTHING = np.zeros((4, 4), np.uint8)
-SURE = 0.98
+BLANK = np.zeros((4, 4), np.uint8)
+CERTAIN = 0.98
 STEP_M = 0.6 * SPACING_M * STRIDE, 0.8 * SPACING_M * STRIDE
-BESIDE = 7  # places elsewhere that a look is a little like
+SIMILAR_PLACES = 7  # places elsewhere that a look is a little like
 
 
-def at(place):
+def point(place):
     return Position(*offset_position(50.0, 8.0, 0.6 * SPACING_M * place, 0.8 * SPACING_M * place))
 
 
-def index_of(positions):
+def make_index(positions):
     """An index of places with these positions (None: unknown), numbered from 101."""
     index = allocate_index(SPEC, len(positions), None)
     index.place_ids[:] = 101 + np.arange(len(positions))
@@ -43,8 +43,8 @@ def index_of(positions):
     return index
 
 
-IN_ORDER = index_of([None] * PLACES)
-IN_METRES = index_of([at(place) for place in range(PLACES)])
+ORDER_INDEX = make_index([None] * PLACES)
+METRIC_INDEX = make_index([point(place) for place in range(PLACES)])
 
 
 class Flight:
@@ -60,23 +60,23 @@ class Flight:
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
         stride = moved_m and OdometryStep(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
-        self.follower.predict(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
+        self.follower.predict(Frame(image=BLANK, name="", t_mono_s=self.t_s), vehicle, stride)
 
     def handle(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
         """A look whose best place is this one (a number between two is one between two places). 80 landmarks agree with
         it, and `rival` with a place elsewhere."""
         best = round(place)
-        others = [slot for slot in others or _beside(best, len(self.index)) if slot != best]
+        others = [slot for slot in others or _choose_similar(best, len(self.index)) if slot != best]
         slots = np.array([best, *others], int)
         scores = np.array([0.3] + [0.29 if lead < 0.1 else 0.25 if rival else 0.2] * len(others), np.float32)
         compared = {slot: FineMatch(float(score)) for slot, score in zip(slots.tolist(), scores, strict=True)}
         counts = {"landmarks": math.log1p(80), "rival": math.log1p(rival)}
         evidence = Evidence(agree=-1.0, lead=lead, coverage=-1.0, **counts)
-        rule = told(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
+        rule = make_model(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
         where = None
         if self.has_poses:
             number = int(self.index.place_ids[best])
-            where = Located(position=at(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
+            where = Located(position=point(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
         return self.follower.update(
             Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where
         )
@@ -92,8 +92,8 @@ class Flight:
         return [self.look(place, p, **more) for place in places]
 
 
-def _beside(best, places):
-    return np.random.default_rng(best).choice(places, min(places, BESIDE), replace=False).tolist()
+def _choose_similar(best, places):
+    return np.random.default_rng(best).choice(places, min(places, SIMILAR_PLACES), replace=False).tolist()
 
 
 def assert_sound(followed):
@@ -106,34 +106,34 @@ def assert_sound(followed):
 
 
 def off_m(followed, place):
-    here, there = followed.estimate.position, at(place)
+    here, there = followed.estimate.position, point(place)
     return distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
 
 
 @pytest.fixture(params=["in order", "positions", "poses"])
 def flight(request, tmp_path):
-    with made_map(tmp_path / "m.gpkg", has_poses=request.param == "poses") as place_map:
-        yield Flight(place_map, IN_ORDER if request.param == "in order" else IN_METRES)
+    with make_bare_map(tmp_path / "m.gpkg", has_poses=request.param == "poses") as place_map:
+        yield Flight(place_map, ORDER_INDEX if request.param == "in order" else METRIC_INDEX)
 
 
 @pytest.fixture
 def bare_map(tmp_path):
-    with made_map(tmp_path / "bare.gpkg", has_poses=False) as place_map:
+    with make_bare_map(tmp_path / "bare.gpkg", has_poses=False) as place_map:
         yield place_map
 
 
 @pytest.fixture
 def posed_map(tmp_path):
-    with made_map(tmp_path / "posed.gpkg", has_poses=True) as place_map:
+    with make_bare_map(tmp_path / "posed.gpkg", has_poses=True) as place_map:
         yield place_map
 
 
-def made_map(path, has_poses):
+def make_bare_map(path, has_poses):
     """A map of a few places: a follower asks it for nothing but how large their ground is."""
     place_map = PlaceMap.create(path, SPEC)
     for place in range(3):
         pose = Pose(up_deg=0.0, footprint_m=FOOTPRINT_M, covariance_m2=(4.0, 0.0, 4.0)) if has_poses else None
-        frame = Frame(image=NOTHING, name=f"{place}", t_mono_s=0.0, position=at(place), pose=pose)
+        frame = Frame(image=BLANK, name=f"{place}", t_mono_s=0.0, position=point(place), pose=pose)
         place_map.add(frame, Descriptor(coarse=np.zeros(1, "<f4")))
     return place_map
 
@@ -157,13 +157,13 @@ def test_place_filter_shares_the_remaining_probability_among_other_places(flight
 
 
 def test_positions_are_those_of_the_places(posed_map, bare_map):
-    posed, bare = Flight(posed_map, IN_METRES), Flight(bare_map, IN_METRES)
+    posed, bare = Flight(posed_map, METRIC_INDEX), Flight(bare_map, METRIC_INDEX)
     for place in np.arange(10, 60, 2.5):
         found = posed.look(place)
         assert off_m(found, place) < SPACING_M / 2
     assert found.estimate.sd_m < SPACING_M
     assert found.estimate.heading_deg == pytest.approx(350.0)
-    assert found.mass > SURE
+    assert found.mass > CERTAIN
     for place in range(10, 60, STRIDE):
         found = bare.look(place)
         assert off_m(found, place) < SPACING_M
@@ -172,14 +172,14 @@ def test_positions_are_those_of_the_places(posed_map, bare_map):
 
 
 def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(posed_map):
-    where = Located(position=at(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
+    where = Located(position=point(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
     slots = np.array([20, 40])
     ranking = Ranking(
         slots=slots, scores=np.array([0.3, 0.3], np.float32), compared={20: FineMatch(0.3), 40: FineMatch(0.3)}
     )
     follower = PlaceFilter(posed_map, max_speed_m_s=None, is_live=True)
-    rule = told(lambda evidence: 0.6, lambda evidence: 0.9)
-    followed = follower.update(ranking, IN_METRES, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), rule, where)
+    rule = make_model(lambda evidence: 0.6, lambda evidence: 0.9)
+    followed = follower.update(ranking, METRIC_INDEX, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), rule, where)
     assert (followed.slot, followed.confidence) == (20, pytest.approx(0.6))
     assert followed.lost == pytest.approx(0.4)
 
@@ -188,7 +188,7 @@ def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(pos
 def test_place_filter_tracks_a_recording_without_times(flight, t_utc_s):
     follower = flight.follower = PlaceFilter(flight.place_map, max_speed_m_s=None, is_live=False)
     for place in range(10, 70, STRIDE):
-        follower.predict(Frame(image=NOTHING, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
+        follower.predict(Frame(image=BLANK, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
         followed = flight.handle(place, 0.9)
         follower.commit()
     assert followed.slot == 67
@@ -207,7 +207,7 @@ def test_place_filter_keeps_only_the_last_pass_of_a_frame(flight):
 
 
 def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_map, bare_map):
-    some = index_of([None if place % 3 == 0 else at(place) for place in range(PLACES)])
+    some = make_index([None if place % 3 == 0 else point(place) for place in range(PLACES)])
     for place_map in (posed_map, bare_map):
         flight = Flight(place_map, some)
         flight.has_poses = False
@@ -217,49 +217,49 @@ def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_ma
         assert followed.lost > 0.9
 
 
-def along(places):
+def measure_displacement_m(places):
     """Metres east and north by so many places."""
-    return offset_between_m(at(0), at(places))
+    return offset_between_m(point(0), point(places))
 
 
-def after_a_gap(place_map, moved_m, away=60, p=0.5):
+def fly_across_gap(place_map, moved_m, away=60, p=0.5):
     """Six places found, three queries that find nothing while the flight goes on, then one that is right."""
-    flight = Flight(place_map, IN_METRES)
+    flight = Flight(place_map, METRIC_INDEX)
     for place in range(6):
-        flight.look(place, moved_m=along(1))
+        flight.look(place, moved_m=measure_displacement_m(1))
     for place in range(6, 9):
         flight.look(place + away, p=0.01, moved_m=moved_m)
     return flight, flight.look(9, p=p, moved_m=moved_m)
 
 
 def test_place_filter_confirms_a_doubtful_match_by_odometry(posed_map):
-    _, blind = after_a_gap(posed_map, None)
-    _, seen = after_a_gap(posed_map, along(1))
+    _, blind = fly_across_gap(posed_map, None)
+    _, seen = fly_across_gap(posed_map, measure_displacement_m(1))
     assert blind.confidence < 0.9  # of a match that is right half the time
     assert seen.confidence > 0.96
     assert off_m(seen, 9) < SPACING_M
 
 
 def test_place_filter_counts_failed_queries_over_the_same_ground_once(posed_map):
-    flight = Flight(posed_map, IN_METRES)
+    flight = Flight(posed_map, METRIC_INDEX)
     for place in range(6):
-        flight.look(place, moved_m=along(1))
-    lost = [flight.look(60, p=0.01, elapsed_s=1.0, moved_m=along(0.02)).lost for _ in range(20)]
+        flight.look(place, moved_m=measure_displacement_m(1))
+    lost = [flight.look(60, p=0.01, elapsed_s=1.0, moved_m=measure_displacement_m(0.02)).lost for _ in range(20)]
     assert lost[-1] < 0.5
 
 
-@pytest.mark.parametrize("moved_m", [None, along(1)])
+@pytest.mark.parametrize("moved_m", [None, measure_displacement_m(1)])
 def test_place_filter_recovers_from_a_wrong_belief(posed_map, moved_m):
     """Carried off by half the map, while the camera sees nothing of it, or sees a motion that is not the aircraft's."""
-    flight, _ = after_a_gap(posed_map, moved_m)
+    flight, _ = fly_across_gap(posed_map, moved_m)
     found = [flight.look(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]
     assert found[-1].confidence >= 0.9
-    assert found[-1].mass > SURE
+    assert found[-1].mass > CERTAIN
     assert off_m(found[-1], 65) < SPACING_M
 
 
 def test_place_filter_never_confirms_one_of_several_twins(posed_map):
-    flight = Flight(posed_map, IN_METRES)
+    flight = Flight(posed_map, METRIC_INDEX)
     for place in range(20, 60, STRIDE):
         followed = flight.look(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)
         assert followed.confidence < 0.9

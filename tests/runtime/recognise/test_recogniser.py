@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from pictures import textured
-from walks import map_of, walk_over
+from walks import make_map, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, ModelError
@@ -30,7 +30,7 @@ def frame(number, t_mono_s=0.0):
 @pytest.fixture(scope="module")
 def whole_map(tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "m.gpkg"
-    return map_of(path, create("cohog", {"w1": 208}), map(frame, range(PLACES)))
+    return make_map(path, create("cohog", {"w1": 208}), map(frame, range(PLACES)))
 
 
 @pytest.fixture
@@ -68,12 +68,12 @@ def test_step_meters_each_step(walk, clock):
     assert event.cost.cpu_s == pytest.approx(0.056)
 
 
-class Wrong(Exception):
+class LibraryError(Exception):
     """What a library may raise."""
 
 
 @pytest.mark.parametrize(
-    "error", [ModelError("no."), MapError("gone."), Wrong("x"), MemoryError(), ZeroDivisionError()]
+    "error", [ModelError("no."), MapError("gone."), LibraryError("x"), MemoryError(), ZeroDivisionError()]
 )
 @pytest.mark.parametrize("where", ["encode", "score_places", "match"])
 def test_step_refuses_with_the_reason_of_any_exception_of_a_technique(walk, error, where):
@@ -128,7 +128,7 @@ def test_step_ignores_places_of_the_same_ground_as_rivals(tmp_path):
         image = np.ascontiguousarray(ground[:, 2 * east_m : 2 * east_m + side_px])
         return Frame(image=image, name=f"{east_m}", t_mono_s=0.0, position=at, heading_deg=0.0, pose=pose)
 
-    with PlaceMap.open(map_of(tmp_path / "dense.gpkg", technique, map(cut, range(0, 880, 20)))) as place_map:
+    with PlaceMap.open(make_map(tmp_path / "dense.gpkg", technique, map(cut, range(0, 880, 20)))) as place_map:
         event = walk_over(place_map, technique, RULE, settings=MatchSettings(candidates=8)).step(cut(400))
     away_m = 20.0 * abs(np.array(event.ranking.compared_slots) - event.ranking.compared_slots[0])
     assert (away_m > 140).sum() >= 3

@@ -24,12 +24,12 @@ from edgevpr.techniques.entropy import compute_filled_bins
 RNG = np.random.default_rng(5)
 
 
-def asked(memorability=0.0, staticity=0.0, entropy=0.0, **keys):
+def make_config(memorability=0.0, staticity=0.0, entropy=0.0, **keys):
     thresholds = {"memorability": memorability, "staticity": staticity, "entropy": entropy}
     return replace(load_config(None).salience, **thresholds, **keys)
 
 
-class Half:
+class HalfMemorable:
     """A network that finds the left of a picture memorable."""
 
     def compute_matrix(self, image):
@@ -45,9 +45,9 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     picture = texture()
     static = np.ones(picture.shape, bool)
     static[:, 120:] = False
-    scores = compute_scores(picture, Half(), static)
+    scores = compute_scores(picture, HalfMemorable(), static)
     assert scores.staticity == pytest.approx(0.75)
-    memorable = interpolate_map(Half().compute_matrix(picture), picture.shape)
+    memorable = interpolate_map(HalfMemorable().compute_matrix(picture), picture.shape)
     assert scores.memorability == pytest.approx(memorable[:, :120].sum() / picture.size, abs=1e-6)
     assert scores.entropy == pytest.approx(compute_filled_bins(picture)[:, :120].sum() / picture.size, abs=1e-6)
     alone = compute_scores(picture)
@@ -58,12 +58,12 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
 @pytest.mark.parametrize(
     ("thresholds", "lacks"),
     [
-        (asked(0.5, 0.6, 0.4), None),
-        (asked(0.51, 0.6, 0.4), "memorability"),
-        (asked(0.5, 0.95, 0.4), "staticity"),
-        (asked(0.5, 0.6, 0.7), "entropy"),
-        (asked(0.51, 0.95, 0.7), "entropy"),  # the one that is farthest below
-        (asked(0, 0, 0), None),
+        (make_config(0.5, 0.6, 0.4), None),
+        (make_config(0.51, 0.6, 0.4), "memorability"),
+        (make_config(0.5, 0.95, 0.4), "staticity"),
+        (make_config(0.5, 0.6, 0.7), "entropy"),
+        (make_config(0.51, 0.95, 0.7), "entropy"),  # the one that is farthest below
+        (make_config(0, 0, 0), None),
     ],
 )
 def test_judge_scores_requires_all_enabled_criteria(thresholds, lacks):
@@ -73,13 +73,13 @@ def test_judge_scores_requires_all_enabled_criteria(thresholds, lacks):
 
 
 def test_judge_scores_ignores_a_score_that_was_not_computed():
-    assert judge_scores(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
+    assert judge_scores(Salience(None, None, 0.5), make_config(0.9, 0.9, 0.4)).reason is None
 
 
 def test_salience_gate_requires_less_entropy_in_bad_light():
     day = [texture() for _ in range(40)]
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
-    by_day, at_night = SalienceGate(asked(entropy=0.4)), SalienceGate(asked(entropy=0.4))
+    by_day, at_night = SalienceGate(make_config(entropy=0.4)), SalienceGate(make_config(entropy=0.4))
     assert all(by_day.judge(picture).reason is None for picture in day)
     passed = [at_night.judge(picture).reason is None for picture in night]
     assert sum(passed) >= 36
@@ -87,7 +87,7 @@ def test_salience_gate_requires_less_entropy_in_bad_light():
 
 
 def test_salience_gate_halves_the_threshold_until_the_light_is_known():
-    gate = SalienceGate(asked(entropy=0.4))
+    gate = SalienceGate(make_config(entropy=0.4))
     little = texture()
     while not 0.2 < compute_scores(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
@@ -96,7 +96,7 @@ def test_salience_gate_halves_the_threshold_until_the_light_is_known():
 
 
 def test_salience_gate_does_not_adapt_to_a_long_stretch_without_information():
-    gate = SalienceGate(asked(entropy=0.4))
+    gate = SalienceGate(make_config(entropy=0.4))
     for _ in range(30):
         assert gate.judge(texture()).reason is None
     empty = np.full((120, 160), 77, np.uint8)
@@ -112,7 +112,7 @@ def test_salience_gate_runs_the_detector_on_every_kth_frame():
             return np.ones(image.shape[:2], bool)
 
     detector = Counting()
-    gate = SalienceGate(asked(staticity=0.6, detect_every=4), detector=detector)
+    gate = SalienceGate(make_config(staticity=0.6, detect_every=4), detector=detector)
     for _ in range(9):
         gate.judge(texture())
     assert detector.looks == 3
@@ -123,7 +123,7 @@ def test_salience_gate_runs_the_detector_on_every_kth_frame():
 NORTH_M = 1 / 111_195  # degrees
 
 
-def event(number, shortfall=0.0, north_m=None):
+def make_event(number, shortfall=0.0, north_m=None):
     position = None if north_m is None else Position(50 + north_m * NORTH_M, 8.0)
     lacks = "entropy" if shortfall else None
     image = np.zeros((8, 8), np.uint8)
@@ -135,7 +135,7 @@ def event(number, shortfall=0.0, north_m=None):
     )
 
 
-def kept(gaps, events):
+def list_kept(gaps, events):
     found = [pair for each in events for pair in gaps.add_frame(each)]
     return [(int(each.frame.name), salience.is_low) for each, salience in [*found, *gaps.end()]]
 
@@ -143,8 +143,8 @@ def kept(gaps, events):
 @pytest.mark.parametrize("seed", range(5))
 def test_place_selector_limits_gaps_in_frames(seed):
     rng = np.random.default_rng(seed)
-    events = [event(number, 0.0 if rng.random() < 0.02 else rng.uniform(0.001, 0.4)) for number in range(500)]
-    numbers = [number for number, _ in kept(PlaceSelector(20), events)]
+    events = [make_event(number, 0.0 if rng.random() < 0.02 else rng.uniform(0.001, 0.4)) for number in range(500)]
+    numbers = [number for number, _ in list_kept(PlaceSelector(20), events)]
     assert numbers == sorted(set(numbers))
     assert max(np.diff([-1, *numbers, 500])) <= 21  # twenty frames without a place between two with one
     assert len(numbers) < 150
@@ -154,12 +154,12 @@ def test_place_selector_limits_gaps_in_frames(seed):
 def test_place_selector_limits_gaps_in_metres(seed):
     rng = np.random.default_rng(seed)
     where_m = np.cumsum(rng.uniform(1, 9, 300))
-    events = [event(number, rng.uniform(0.001, 0.4), where) for number, where in enumerate(where_m)]
-    places_m = [where_m[number] for number, _ in kept(PlaceSelector(10_000, 40.0), events)]
+    events = [make_event(number, rng.uniform(0.001, 0.4), where) for number, where in enumerate(where_m)]
+    places_m = [where_m[number] for number, _ in list_kept(PlaceSelector(10_000, 40.0), events)]
     assert max(np.diff([where_m[0], *places_m])) <= 40.01
 
 
 def test_place_selector_marks_the_best_frames_kept_to_limit_a_gap():
-    events = [event(0), *(event(number, 0.2) for number in range(1, 21))]
-    events[7], events[12] = event(7, 0.07), event(12, 0.08)
-    assert kept(PlaceSelector(20), [*events, event(21, 0.2)]) == [(0, False), (7, True), (12, True)]
+    events = [make_event(0), *(make_event(number, 0.2) for number in range(1, 21))]
+    events[7], events[12] = make_event(7, 0.07), make_event(12, 0.08)
+    assert list_kept(PlaceSelector(20), [*events, make_event(21, 0.2)]) == [(0, False), (7, True), (12, True)]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from map_writer import write_sql
 from pictures_of_nothing import figures
-from sureness import landmarks_count, sure_rule, told
-from walks import map_of, walk_over
+from sureness import make_model, make_rule, rate_by_landmarks
+from walks import make_map, walk_over
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 PLACES = 4
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
-BY_LANDMARKS = sure_rule(landmarks_count)
+BY_LANDMARKS = make_rule(rate_by_landmarks)
 
 
 def ground(seed):
@@ -50,23 +50,23 @@ def technique():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, technique):
-    return map_of(tmp_path_factory.mktemp("map") / "m.gpkg", technique, map(frame, range(PLACES)))
+def shared_map(tmp_path_factory, technique):
+    return make_map(tmp_path_factory.mktemp("map") / "m.gpkg", technique, map(frame, range(PLACES)))
 
 
 @pytest.fixture
-def mapped(whole, tmp_path):
+def map_copy(shared_map, tmp_path):
     """A copy of the map, to be changed."""
-    return Path(shutil.copy(whole, tmp_path))
+    return Path(shutil.copy(shared_map, tmp_path))
 
 
-def keep(path, landmarks, checksum):
+def store(path, landmarks, checksum):
     """Write other landmarks for the second place."""
     blob, number = ("NULL", "NULL") if landmarks is None else (f"x'{landmarks.hex()}'", checksum)
     write_sql(path, f"UPDATE places SET landmarks = {blob}, landmarks_crc32 = {number} WHERE place_id = 2")
 
 
-def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
+def run_query(path, technique, query, rule=RULE, times=1, search=None, verify=True):
     """The event of a query; of the last, where it is asked several times."""
     with PlaceMap.open(path) as place_map:
         settings = MatchSettings(candidates=technique.candidates, verify=verify)
@@ -74,8 +74,8 @@ def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
         return [walk.step(query) for _ in range(times)][-1]
 
 
-def test_verify_finds_the_landmarks_of_a_downward_map(mapped, technique):
-    event = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS)
+def test_verify_finds_the_landmarks_of_a_downward_map(map_copy, technique):
+    event = run_query(map_copy, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.accepted
     assert event.reason.parameters["landmarks"] == event.agreement.inliers
     assert event.agreement.inliers >= 10
@@ -85,76 +85,76 @@ def test_verify_finds_the_landmarks_of_a_downward_map(mapped, technique):
 
 
 @pytest.fixture(scope="module")
-def mapped_ahead(tmp_path_factory):
+def forward_map(tmp_path_factory):
     """A map made by a camera that looks ahead, of pictures twice as wide as high."""
-    return map_of(tmp_path_factory.mktemp("ahead") / "m.gpkg", create("cohog"), map(wide, range(PLACES)))
+    return make_map(tmp_path_factory.mktemp("ahead") / "m.gpkg", create("cohog"), map(crop_wide, range(PLACES)))
 
 
-def wide(seed, right_px=0, down_px=0):
+def crop_wide(seed, right_px=0, down_px=0):
     cut = frame(seed, right_px, down_px)
     return replace(cut, image=cut.image[:160])
 
 
-def proof_of(path, confidence, of_map=1.0, moved_px=(10, -16)):
+def read_proof(path, confidence, of_map=1.0, moved_px=(10, -16)):
     """What landmarks say of a query of the second place, whose match is so sure without them."""
-    rule = sure_rule(lambda evidence: confidence)
-    rule = replace(rule, confidence_rule=told(lambda evidence: confidence, lambda evidence: of_map))
-    event = asked(path, create("cohog"), wide(1, *moved_px), rule)
+    rule = make_rule(lambda evidence: confidence)
+    rule = replace(rule, confidence_rule=make_model(lambda evidence: confidence, lambda evidence: of_map))
+    event = run_query(path, create("cohog"), crop_wide(1, *moved_px), rule)
     assert event.agreement is None, "they never speak against a match"
     assert event.best.place.place_id == 2
     return event.evidence.proof
 
 
-def test_verify_uses_landmarks_of_a_forward_camera_if_the_match_is_uncertain(mapped_ahead):
-    assert proof_of(mapped_ahead, 0.5) > math.log(2)
-    assert proof_of(mapped_ahead, 0.95) == 0, "it is sure"
-    assert proof_of(mapped_ahead, 0.5, of_map=0.1) == 0, "they would not tell that it is on the map"
-    assert proof_of(mapped_ahead, 0.5, moved_px=(0, 0)) == 0, "a display drawn over every picture agrees as well"
+def test_verify_uses_landmarks_of_a_forward_camera_if_the_match_is_uncertain(forward_map):
+    assert read_proof(forward_map, 0.5) > math.log(2)
+    assert read_proof(forward_map, 0.95) == 0, "it is sure"
+    assert read_proof(forward_map, 0.5, of_map=0.1) == 0, "they would not tell that it is on the map"
+    assert read_proof(forward_map, 0.5, moved_px=(0, 0)) == 0, "a display drawn over every picture agrees as well"
 
 
-def test_verify_refuses_a_clear_match_with_landmarks_of_another_image(mapped, technique):
+def test_verify_refuses_a_clear_match_with_landmarks_of_another_image(map_copy, technique):
     others = pack_bytes(detect_landmarks(frame(77).image))
-    keep(mapped, others, zlib.crc32(others))
-    event = asked(mapped, technique, frame(1, 20, -10))
+    store(map_copy, others, zlib.crc32(others))
+    event = run_query(map_copy, technique, frame(1, 20, -10))
     assert event.best.match.score > 0.2
     assert (event.accepted, event.failed, event.position) == (False, False, None)
     assert event.reason.code is ReasonCode.FEW_LANDMARKS
-    assert asked(mapped, technique, frame(2, 20, -10)).accepted, "the other places are as they were"
+    assert run_query(map_copy, technique, frame(2, 20, -10)).accepted, "the other places are as they were"
 
 
-def test_verify_refuses_a_place_whose_landmarks_and_regions_disagree(mapped, technique):
+def test_verify_refuses_a_place_whose_landmarks_and_regions_disagree(map_copy, technique):
     turned = pack_bytes(detect_landmarks(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
-    keep(mapped, turned, zlib.crc32(turned))
-    event = asked(mapped, technique, frame(1, 20, -10))
+    store(map_copy, turned, zlib.crc32(turned))
+    event = run_query(map_copy, technique, frame(1, 20, -10))
     assert not event.accepted
     assert event.reason.code is ReasonCode.LANDMARKS_DISAGREE
 
 
-def behind_figures(image):
+def draw_figures(image):
     return figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
 
 
-def test_verify_detects_an_overlay_by_unshifted_matches_of_other_places(tmp_path, mapped, technique):
-    anything = sure_rule(lambda evidence: 1.0)
-    drawn = [replace(frame(place), image=behind_figures(frame(place).image)) for place in range(PLACES)]
-    path = map_of(tmp_path / "drawn.gpkg", technique, drawn)
+def test_verify_detects_an_overlay_by_unshifted_matches_of_other_places(tmp_path, map_copy, technique):
+    anything = make_rule(lambda evidence: 1.0)
+    drawn = [replace(frame(place), image=draw_figures(frame(place).image)) for place in range(PLACES)]
+    path = make_map(tmp_path / "drawn.gpkg", technique, drawn)
     changed = cv2.addWeighted(frame(1).image, 0.3, frame(7).image, 0.7, 0)
-    at_rest = asked(path, technique, replace(frame(1), image=behind_figures(changed)), anything)
+    at_rest = run_query(path, technique, replace(frame(1), image=draw_figures(changed)), anything)
     assert (at_rest.accepted, at_rest.position) == (False, None)
     assert at_rest.reason.code is ReasonCode.ELSEWHERE_AT_REST
-    assert asked(mapped, technique, replace(frame(1), image=changed), anything).accepted, "without a display"
-    assert asked(path, technique, drawn[1], anything).accepted, "its ground agrees much better than the figures"
-    moved = replace(drawn[1], image=behind_figures(frame(1, 20, -10).image))
-    assert asked(path, technique, moved, anything).accepted
+    assert run_query(map_copy, technique, replace(frame(1), image=changed), anything).accepted, "without a display"
+    assert run_query(path, technique, drawn[1], anything).accepted, "its ground agrees much better than the figures"
+    moved = replace(drawn[1], image=draw_figures(frame(1, 20, -10).image))
+    assert run_query(path, technique, moved, anything).accepted
 
 
-def far(image):
+def move_far(image):
     return Frame(image=image, name="again.png", t_mono_s=0.0, position=Position(51.0, 8.0))
 
 
 def test_verify_gives_ground_mapped_twice_at_most_an_even_chance(tmp_path, technique):
-    path = map_of(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(frame(1).image)])
-    event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
+    path = make_map(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), move_far(frame(1).image)])
+    event = run_query(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert (event.accepted, event.confidence) == (False, 0.5)
 
 
@@ -163,25 +163,25 @@ def test_verify_does_not_accept_nearly_duplicate_ground_by_landmarks(tmp_path, t
     """A place elsewhere without landmarks may be the right one as well."""
     changed = frame(1).image.copy()
     changed[:, :80] = frame(9).image[:, :80]
-    path = map_of(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(changed)])
+    path = make_map(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), move_far(changed)])
     if not has_landmarks:
         write_sql(path, "UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 2")
-    event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
+    event = run_query(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.best.place.source_image == "1.png"
     assert not event.accepted
     assert event.reason.code is ReasonCode.LOW_CONFIDENCE
 
 
-def bare(seed, right_px=0, down_px=0):
+def unplaced(seed, right_px=0, down_px=0):
     return replace(frame(seed, right_px, down_px), position=None)
 
 
 @pytest.fixture(scope="module")
 def overlapping(tmp_path_factory, technique):
     """Places without positions: the first, the fifth and the eighth show the same ground."""
-    same, other = [bare(1, -25, -10), bare(1, 25, 10), bare(1, 0, 28)], list(map(bare, range(2, 7)))
+    same, other = [unplaced(1, -25, -10), unplaced(1, 25, 10), unplaced(1, 0, 28)], list(map(unplaced, range(2, 7)))
     order = [same[0], *other[:3], same[1], *other[3:], same[2]]
-    return map_of(tmp_path_factory.mktemp("overlapping") / "m.gpkg", technique, order)
+    return make_map(tmp_path_factory.mktemp("overlapping") / "m.gpkg", technique, order)
 
 
 def same_ground(path, technique, query):
@@ -194,7 +194,7 @@ def same_ground(path, technique, query):
 
 
 def test_verify_treats_overlapping_places_without_positions_as_the_same_ground(overlapping, technique):
-    for query in (bare(1, 3, 2), bare(1, -15, 5)):
+    for query in (unplaced(1, 3, 2), unplaced(1, -15, 5)):
         event, best, same = same_ground(overlapping, technique, query)
         assert {best, *same} == {1, 5, 8}
         assert event.accepted
@@ -204,36 +204,36 @@ def test_verify_treats_overlapping_places_without_positions_as_the_same_ground(o
 @pytest.mark.parametrize(
     "blob", [None, b"", b"\x09of a newer form", pack_bytes(detect_landmarks(np.zeros((9, 9), np.uint8)))]
 )
-def test_verify_judges_a_place_without_landmarks_as_before(mapped, technique, blob):
-    without = asked(mapped, technique, frame(1, 20, -10), verify=False)
-    keep(mapped, blob, None if blob is None else zlib.crc32(blob))
-    event = asked(mapped, technique, frame(1, 20, -10))
+def test_verify_judges_a_place_without_landmarks_as_before(map_copy, technique, blob):
+    without = run_query(map_copy, technique, frame(1, 20, -10), verify=False)
+    store(map_copy, blob, None if blob is None else zlib.crc32(blob))
+    event = run_query(map_copy, technique, frame(1, 20, -10))
     assert (event.accepted, event.best, without.accepted) == (True, without.best, True)
     assert event.agreement is None or event.agreement.inliers == 0
     assert without.agreement is None
     assert "landmarks" not in to_fields(without)
 
 
-def test_verify_refuses_damaged_landmarks_and_leaves_the_place_out(mapped, technique):
-    keep(mapped, b"damaged", 1)
-    event = asked(mapped, technique, frame(1, 20, -10))
+def test_verify_refuses_damaged_landmarks_and_leaves_the_place_out(map_copy, technique):
+    store(map_copy, b"damaged", 1)
+    event = run_query(map_copy, technique, frame(1, 20, -10))
     assert (event.accepted, event.failed, event.map_lost) == (False, True, False)
     assert event.reason.code is ReasonCode.PLACE_UNREADABLE
     assert event.left_out == ((2, "its set of landmarks does not match its checksum"),)
-    again = asked(mapped, technique, frame(1, 20, -10), times=2)
+    again = run_query(map_copy, technique, frame(1, 20, -10), times=2)
     assert (again.accepted, again.failed) == (False, False)
     assert again.reason.code in (ReasonCode.PLACE_UNREAD, ReasonCode.LOW_SCORE)
 
 
-def test_verify_applies_the_mask_to_landmarks(whole, technique, tmp_path):
+def test_verify_applies_the_mask_to_landmarks(shared_map, technique, tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:, :160] = False
-    path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], mask=OverlayMask(allowed, "half"))
+    path = make_map(tmp_path / "half.gpkg", technique, [frame(1)], mask=OverlayMask(allowed, "half"))
     with PlaceMap.open(path) as place_map:
         there = unpack_bytes(place_map.read_landmarks(1))
     assert len(there) > 30
     assert there.points[:, 0].min() > 0
 
 
-def test_verify_skips_landmarks_of_a_sequence(mapped, technique):
-    assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).agreement is None
+def test_verify_skips_landmarks_of_a_sequence(map_copy, technique):
+    assert run_query(map_copy, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).agreement is None

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from commands import refused
 from flight_process import ended, simulated_autopilot, start, wait_for
-from flights import PLACES, of_kind
+from flights import PLACES, select
 from mavlink_peers import Peer, UdpPort
 
 from edgevpr.cli.main import main
@@ -19,7 +19,7 @@ from edgevpr.runtime.flight.recording import TAPE, list_recordings
 
 pytestmark = pytest.mark.slow
 
-QUICK = "--rate-hz", "15"
+FAST_RATE = "--rate-hz", "15"
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def fly(recording, tmp_path):
     return started
 
 
-def is_the_same(log, **how):
+def replay_and_compare(log, **how):
     """Replay the flight of a log, and hold both against each other; give the lines of the replay."""
     again = replay(log, **how)
     lines = compare_lines(again.flown, again.lines)
@@ -47,12 +47,12 @@ def is_the_same(log, **how):
 
 def test_replay_of_an_ardupilot_flight_is_identical(fly, tmp_path):
     with simulated_autopilot() as (link, _):
-        ended(fly("--link", link, *QUICK))
-    again, lines = is_the_same(tmp_path / "flight.jsonl")
+        ended(fly("--link", link, *FAST_RATE))
+    again, lines = replay_and_compare(tmp_path / "flight.jsonl")
     assert again.why_ended is None
     assert lines.after == 0
     assert [line["kind"] for line in (again.lines[0], again.lines[-1])] == ["start", "end"]
-    assert len(of_kind(again.lines, "query")) == PLACES
+    assert len(select(again.lines, "query")) == PLACES
     sent = again.lines[-1]["mavlink"]["sent"]
     assert again.packets.alike >= sum(sent.values()) > PLACES, "every packet was compared"
 
@@ -60,7 +60,7 @@ def test_replay_of_an_ardupilot_flight_is_identical(fly, tmp_path):
 def test_replay_of_a_px4_flight_is_identical(fly, tmp_path):
     with simulated_autopilot(vehicle="px4-plane") as (link, _):
         ended(fly("--link", link, "--rate-hz", "8"))
-    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    again, _ = replay_and_compare(tmp_path / "flight.jsonl")
     assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0
 
 
@@ -73,7 +73,7 @@ def test_replay_includes_signals_and_a_closed_terminal(fly, tmp_path):
         wait_for("query", log, flight, count=5)
         flight.send_signal(signal.SIGTERM)
         ended(flight)
-    again, _ = is_the_same(log)
+    again, _ = replay_and_compare(log)
     assert again.why_ended is None
 
 
@@ -85,9 +85,9 @@ def test_replay_of_a_flight_timed_by_its_images_is_identical(fly, recording, tmp
         rows.append(f"{picture},,,{1000 + 0.1 * number:.1f}")
     (tmp_path / "positions.csv").write_text("\n".join(["file,lat,lon,time", *rows]))
     ended(fly("--rate-hz", "0.02", pictures=tmp_path))
-    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    again, _ = replay_and_compare(tmp_path / "flight.jsonl")
     assert again.lines[0]["decided"]["rate_hz"] == pytest.approx(10)
-    assert len(of_kind(again.lines, "query")) == 6
+    assert len(select(again.lines, "query")) == 6
 
 
 def test_replay_of_a_killed_flight_ends_with_its_tape(fly, tmp_path):
@@ -97,14 +97,14 @@ def test_replay_of_a_killed_flight_ends_with_its_tape(fly, tmp_path):
         wait_for("query", log, flight, count=12)
         flight.kill()
         ended(flight, -signal.SIGKILL)
-    again, _ = is_the_same(log)
+    again, _ = replay_and_compare(log)
     assert again.why_ended
-    assert len(of_kind(again.lines, "query")) >= 2, "what is half a second old is on the disk"
+    assert len(select(again.lines, "query")) >= 2, "what is half a second old is on the disk"
     tape = list_recordings(tmp_path / "recorded")[-1] / TAPE
     first, rest = tape.read_bytes().split(b"\n", 1)
     for share in (0.1, 0.6):  # a power cut, at any byte
         tape.write_bytes(first + b"\n" + rest[: round(share * len(rest))])
-        shorter, _ = is_the_same(log)
+        shorter, _ = replay_and_compare(log)
         assert len(shorter.lines) <= len(again.lines)
 
 
@@ -122,7 +122,7 @@ def test_replay_ignores_only_the_signature_of_signed_packets(fly, tmp_path):
     unsigned.heartbeat()
     ended(flight)
     port.close()
-    again, _ = is_the_same(tmp_path / "flight.jsonl")
+    again, _ = replay_and_compare(tmp_path / "flight.jsonl")
     assert (tmp_path / "time").exists()
     assert again.packets.alike > 0
     assert again.lines[-1]["mavlink"]["refused_signatures"] == {"unsigned": 1}
@@ -131,7 +131,7 @@ def test_replay_ignores_only_the_signature_of_signed_packets(fly, tmp_path):
 
 
 def test_replay_reports_a_different_answer_of_a_technique(fly, tmp_path, monkeypatch, capsys):
-    ended(fly(*QUICK))
+    ended(fly(*FAST_RATE))
     log = str(tmp_path / "flight.jsonl")
     assert main(["replay", log]) == 0
     assert " lines are equal, 0 differ" in capsys.readouterr().out
@@ -151,7 +151,7 @@ def test_replay_reports_missing_files(fly, recording, tmp_path, capsys):
     log.unlink()
     place_map = tmp_path / "m.gpkg"
     shutil.copy(recording / "cohog.gpkg", place_map)
-    ended(fly(*QUICK, place_map=place_map))
+    ended(fly(*FAST_RATE, place_map=place_map))
     place_map.rename(tmp_path / "elsewhere.gpkg")
     assert "--map" in refused(capsys, "replay", log)
     assert main(["replay", str(log), "--map", str(tmp_path / "elsewhere.gpkg")]) == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from flight_process import start
-from flights import of_kind
+from flights import select
 from ground_stations import mavproxy_with
 from loopback import free_port, wait_until
 from mavlink_peers import AutopilotThread, Peer, SerialCable, UdpPort
@@ -29,7 +29,7 @@ needs_router = pytest.mark.skipif(
 )
 
 
-def written(section: str, language: str) -> str:
+def read_code_block(section: str, language: str) -> str:
     """The block of this language under a heading of the page."""
     text = PAGE.read_text().split(f"## {section}\n")[1].split("\n## ")[0]
     return re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)[1]
@@ -38,7 +38,7 @@ def written(section: str, language: str) -> str:
 @contextmanager
 def mavlink_router(put, folder):
     settings = folder / "main.conf"
-    settings.write_text("[General]\nTcpServerPort = 0\n\n" + put(written("mavlink-router owns it", "ini")))
+    settings.write_text("[General]\nTcpServerPort = 0\n\n" + put(read_code_block("mavlink-router owns it", "ini")))
     router = subprocess.Popen(["mavlink-routerd", "-c", settings], stderr=subprocess.DEVNULL)
     try:
         yield
@@ -49,7 +49,7 @@ def mavlink_router(put, folder):
 
 @contextmanager
 def mavproxy(put, folder):
-    _, *flags = shlex.split(put(written("MAVProxy owns it", "sh")))
+    _, *flags = shlex.split(put(read_code_block("MAVProxy owns it", "sh")))
     with mavproxy_with(folder, *flags):
         yield
 
@@ -81,7 +81,7 @@ def test_run_survives_a_router_killed_in_flight(recording, tmp_path, owner, sect
         pilot = AutopilotThread(f"serial:{cable.ends[0]}:921600")
         stack.callback(pilot.finish)  # before its cable is unplugged, whatever fails
         config = tmp_path / "config.yaml"
-        config.write_text(put(written(section, "yaml")))
+        config.write_text(put(read_code_block(section, "yaml")))
         images = recording / "blind" / "images"
         flight = start(recording / "cohog.gpkg", images, log, "--config", config, "--rate-hz", "1")
         stack.callback(flight.communicate)
@@ -89,7 +89,7 @@ def test_run_survives_a_router_killed_in_flight(recording, tmp_path, owner, sect
 
         def accepted():
             assert flight.poll() is None, flight.communicate()[1]
-            answers = of_kind(read_log(log), "answer") if log.exists() else []
+            answers = select(read_log(log), "answer") if log.exists() else []
             return sum(line["result"] == "ACCEPTED" for line in answers)
 
         station = Peer(station_port, system_id=255)

@@ -8,7 +8,7 @@ import yaml
 from answering_autopilot import AnsweringAutopilot
 from loopback import free_port
 from pictures import textured, write_flight
-from walks import map_of
+from walks import make_map
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
@@ -31,7 +31,7 @@ def flight_folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("flight")
     frames = [Frame(image=textured(seed), name=f"{seed}.png", t_mono_s=0.0) for seed in range(2)]
     write_flight(folder / "images", [frame.image for frame in frames])
-    map_of(folder / "valley.gpkg", techniques.create("hog"), frames)
+    make_map(folder / "valley.gpkg", techniques.create("hog"), frames)
     return folder
 
 
@@ -52,7 +52,7 @@ def config_file(tmp_path) -> Path:
     return tmp_path / "config.yaml"
 
 
-def wrong(config_file: Path, settings: dict) -> list[Finding]:
+def find_offline_faults(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong without an autopilot and without waiting for a frame."""
     config_file.write_text(yaml.safe_dump(settings))
     findings = check_configuration(config_file, offline=True)
@@ -62,11 +62,11 @@ def wrong(config_file: Path, settings: dict) -> list[Finding]:
 
 def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(settings, config_file, monkeypatch):
     monkeypatch.setattr(check, "measure_query", lambda *_: 6.0)
-    (finding,) = wrong(config_file, settings)
+    (finding,) = find_offline_faults(config_file, settings)
     assert (finding.what, finding.reason.code) == ("map", FindingCode.QUERY_TOO_SLOW)
     assert finding.reason.parameters["t_query_s"] == 6.0
     settings["mavlink"]["send_fixes"] = False
-    assert wrong(config_file, settings) == []
+    assert find_offline_faults(config_file, settings) == []
 
 
 @pytest.mark.parametrize(("board", "is_other"), [("this", False), ("thesis-xeon", True)])
@@ -82,15 +82,15 @@ def test_check_opens_the_signing_key(settings, config_file, tmp_path):
     key.write_bytes(bytes(32))
     key.chmod(0o600)
     settings["mavlink"]["signing_key"] = str(key)
-    assert wrong(config_file, settings) == []
+    assert find_offline_faults(config_file, settings) == []
     assert not key.with_name("key.time").exists(), "root must not make what the service is to write"
     key.chmod(0o640)
-    (finding,) = wrong(config_file, settings)
+    (finding,) = find_offline_faults(config_file, settings)
     assert finding.what == "link"
 
 
 def test_check_leaves_no_files(settings, config_file, tmp_path, flight_folder):
-    assert wrong(config_file, settings) == []
+    assert find_offline_faults(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]
     assert sorted(path.name for path in flight_folder.iterdir()) == ["images", "valley.gpkg"]
 
@@ -122,7 +122,7 @@ def test_check_stops_at_an_unreadable_configuration(config_file, text):
     ],
 )
 def test_check_finds_faults_offline(settings, config_file, changes, wrong_things):
-    assert [finding.what for finding in wrong(config_file, settings | changes)] == wrong_things
+    assert [finding.what for finding in find_offline_faults(config_file, settings | changes)] == wrong_things
 
 
 def test_check_of_an_unknown_board_does_not_open_the_map(settings, config_file):
@@ -145,19 +145,19 @@ def test_check_reports_places_beyond_the_budget(settings, config_file):
     assert "are not loaded" in finding.reason.parameters["technique"]
 
 
-def wrong_online(config_file: Path, settings: dict) -> list[Finding]:
+def find_online_faults(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong when it waits for a frame and a heartbeat."""
     config_file.write_text(yaml.safe_dump(settings))
     return [finding for finding in check_configuration(config_file) if not finding.ok]
 
 
-def autopilot_of(settings: dict, **how) -> AnsweringAutopilot:
+def start_autopilot(settings: dict, **how) -> AnsweringAutopilot:
     return AnsweringAutopilot(parse_link(settings["mavlink"]["link"]).number, **how)
 
 
 def test_check_waits_for_a_frame_and_a_heartbeat(settings, config_file, capsys):
     config_file.write_text(yaml.safe_dump(settings))
-    with autopilot_of(settings, system_id=7) as autopilot:
+    with start_autopilot(settings, system_id=7) as autopilot:
         assert main(["check", "--config", str(config_file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines] == ITEMS
@@ -166,15 +166,15 @@ def test_check_waits_for_a_frame_and_a_heartbeat(settings, config_file, capsys):
 
 def test_check_finds_another_autopilot_than_the_configured(settings, config_file):
     settings["mavlink"]["system_id"] = 3
-    with autopilot_of(settings, system_id=4):
-        (finding,) = wrong_online(config_file, settings)
+    with start_autopilot(settings, system_id=4):
+        (finding,) = find_online_faults(config_file, settings)
     assert (finding.reason.code, finding.reason.parameters["systems"]) == (FindingCode.OTHER_SYSTEM, "4")
 
 
 def test_check_finds_a_camera_without_frames(settings, config_file):
     settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port()}/camera"
     settings["mavlink"]["link"] = None
-    (finding,) = wrong_online(config_file, settings)
+    (finding,) = find_online_faults(config_file, settings)
     assert (finding.what, finding.reason.code) == ("source", FindingCode.NO_FRAME)
 
 
@@ -183,7 +183,7 @@ def test_check_does_not_count_a_damaged_image_as_a_frame(settings, config_file, 
     folder.mkdir()
     (folder / "1.png").write_bytes(b"no picture")
     settings["source"]["uri"], settings["mavlink"]["link"] = str(folder), None
-    (finding,) = wrong_online(config_file, settings)
+    (finding,) = find_online_faults(config_file, settings)
     assert finding.what == "source"
     shutil.copy(next(Path(settings["map"]).parent.glob("images/*.png")), folder / "2.png")
-    assert wrong_online(config_file, settings) == []
+    assert find_online_faults(config_file, settings) == []

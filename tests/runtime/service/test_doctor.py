@@ -62,7 +62,7 @@ def with_parameters(reading: AutopilotReading, **parameters) -> AutopilotReading
     return replace(reading, parameters=reading.parameters | parameters)
 
 
-def wrong(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
+def faults(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
     """What is wrong, and the changes that it needs."""
     return {each.what: each.changes for each in check_autopilot(reading, link, plan) if not each.ok}
 
@@ -75,7 +75,7 @@ SIGNED = replace(MUTE, signs=True, signs_requests=True)
 
 
 def test_check_autopilot_accepts_a_configured_copter_and_px4():
-    assert wrong(COPTER) == wrong(PX4) == {}
+    assert faults(COPTER) == faults(PX4) == {}
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_check_autopilot_accepts_a_configured_copter_and_px4():
     ],
 )
 def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
-    assert wrong(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)) == {}
+    assert faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)) == {}
 
 
 @pytest.mark.parametrize("vehicle", ["copter", "rover", "vehicle"])
@@ -98,22 +98,22 @@ def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
     "parameters", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
 )
 def test_check_autopilot_requires_a_second_receiver_without_another_source(vehicle, parameters):
-    found = wrong(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
+    found = faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
     assert found == {"channel": ("GPS2_TYPE=14",)}
-    assert wrong(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
+    assert faults(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
 
 
 def test_check_autopilot_names_parameters_as_the_firmware_does():
-    assert wrong(BARE) == {"channel": ("GPS2_TYPE=14",)}
-    assert wrong(with_parameters(BARE, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert faults(BARE) == {"channel": ("GPS2_TYPE=14",)}
+    assert faults(with_parameters(BARE, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 0, "GPS_AUTO_SWITCH": 1})
-    assert wrong(older) == {"channel": ("GPS_TYPE2=14",)}
-    assert wrong(replace(older, parameters=older.parameters | {"GPS_TYPE": 14})) == {}
+    assert faults(older) == {"channel": ("GPS_TYPE2=14",)}
+    assert faults(replace(older, parameters=older.parameters | {"GPS_TYPE": 14})) == {}
 
 
 def test_check_autopilot_has_a_finding_for_each_broken_rule():
     several = with_parameters(COPTER, GPS_AUTO_SWITCH=4, GPS_PRIMARY=1, EK3_SRC1_POSXY=6, AHRS_EKF_TYPE=2, EK3_ENABLE=0)
-    assert wrong(several) == {
+    assert faults(several) == {
         "GPS_PRIMARY": ("GPS_PRIMARY=0",),
         "EK3_SRCn_POSXY": ("EK3_SRC1_POSXY=3",),
         "AHRS_EKF_TYPE": ("EK3_ENABLE=1", "AHRS_EKF_TYPE=3"),
@@ -122,10 +122,10 @@ def test_check_autopilot_has_a_finding_for_each_broken_rule():
 
 def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
     changes = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
-    assert wrong(VISUAL) == {"EK3_SRCn_POSXY": changes}
+    assert faults(VISUAL) == {"EK3_SRCn_POSXY": changes}
     prepared = with_parameters(VISUAL, EK3_SRC2_POSXY=6)
-    assert wrong(prepared) == {}
-    assert set(wrong(replace(prepared, origin=None))) == {"origin"}
+    assert faults(prepared) == {}
+    assert set(faults(replace(prepared, origin=None))) == {"origin"}
 
 
 @pytest.mark.parametrize(
@@ -150,30 +150,30 @@ def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
     ],
 )
 def test_check_autopilot_finds_each_fault_alone(change, what, changes):
-    assert wrong(replace(COPTER, **change)) == {what: changes}
+    assert faults(replace(COPTER, **change)) == {what: changes}
 
 
 def test_check_autopilot_accepts_unknown_values():
-    assert wrong(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
+    assert faults(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
 
 
 def test_check_autopilot_wants_a_faster_line():
-    assert wrong(replace(COPTER, round_trip_s=0.4), SERIAL) == {"link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")}
+    assert faults(replace(COPTER, round_trip_s=0.4), SERIAL) == {"link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")}
     px4_changes = ("MAV_1_CONFIG=102", "MAV_1_MODE=2", "SER_TEL2_BAUD=921600")
-    assert wrong(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
+    assert faults(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
 
 
 def test_check_autopilot_reports_only_the_link_without_an_answer():
-    assert set(wrong(MUTE)) == set(wrong(SIGNED)) == {"link"}
-    assert set(wrong(replace(MUTE, signs=True))) == {"link", "signing"}
-    assert wrong(replace(COPTER, signs=True)) == {}
+    assert set(faults(MUTE)) == set(faults(SIGNED)) == {"link"}
+    assert set(faults(replace(MUTE, signs=True))) == {"link", "signing"}
+    assert faults(replace(COPTER, signs=True)) == {}
 
 
 @pytest.mark.parametrize("vehicle", ["copter", "rover"])
 def test_check_autopilot_wants_no_second_receiver_for_a_dry_run(vehicle):
     bare = replace(COPTER, vehicle=vehicle, parameters=PLAIN | {"GPS_AUTO_SWITCH": 0})
-    assert wrong(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
-    assert wrong(bare, plan=DRY) == {}
+    assert faults(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert faults(bare, plan=DRY) == {}
 
 
 @pytest.mark.parametrize(
@@ -186,43 +186,43 @@ def test_check_autopilot_wants_no_second_receiver_for_a_dry_run(vehicle):
 )
 def test_check_autopilot_finds_parameters_that_prevent_arming_in_a_dry_run(parameters, change):
     ready = replace(COPTER, parameters=PLAIN | parameters)
-    assert wrong(ready) == {}
-    assert wrong(ready, plan=DRY) == {"channel": (change,)}
+    assert faults(ready) == {}
+    assert faults(ready, plan=DRY) == {"channel": (change,)}
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 14})
-    assert wrong(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
+    assert faults(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
 
 
 def test_check_autopilot_accepts_a_constant_position_of_px4_alone():
-    assert wrong(replace(PX4, filter_flags=0x3FF)) == {}, "as a real one says on the pad"
-    assert set(wrong(replace(COPTER, filter_flags=0x3FF))) == {"filter"}
+    assert faults(replace(PX4, filter_flags=0x3FF)) == {}, "as a real one says on the pad"
+    assert set(faults(replace(COPTER, filter_flags=0x3FF))) == {"filter"}
 
 
 def test_check_autopilot_wants_px4_to_use_message_296():
     bare = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
-    assert wrong(bare) == {
+    assert faults(bare) == {
         "channel": ("EKF2_AGP0_CTRL=1",),
         "EKF2_AGP0_DELAY": ("EKF2_AGP0_DELAY=0",),
         "EKF2_AGP0_ID": ("EKF2_AGP0_ID=1",),
     }
-    assert wrong(with_parameters(PX4, EKF2_AGP0_CTRL=2)) == {"channel": ("EKF2_AGP0_CTRL=1",)}
+    assert faults(with_parameters(PX4, EKF2_AGP0_CTRL=2)) == {"channel": ("EKF2_AGP0_CTRL=1",)}
 
 
 def test_check_autopilot_wants_odometry_of_a_px4_without_message_296():
     without = replace(PX4, parameters={})
-    assert wrong(without) == wrong(with_parameters(without, EKF2_OF_CTRL=1)) == {"channel": ("EKF2_EV_CTRL=1",)}
+    assert faults(without) == faults(with_parameters(without, EKF2_OF_CTRL=1)) == {"channel": ("EKF2_EV_CTRL=1",)}
     (others,) = (each for each in check_autopilot(with_parameters(without, EKF2_EV_CTRL=15), UDP, FIXES) if not each.ok)
     assert (others.changes, others.reason.parameters["value"]) == (("EKF2_EV_CTRL=1",), 15)
-    assert wrong(with_parameters(without, EKF2_EV_CTRL=1)) == {}
-    assert wrong(with_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1)).keys() == {"EKF2_EV_NOISE_MD"}
-    assert wrong(replace(without, vehicle="plane")) == {}
+    assert faults(with_parameters(without, EKF2_EV_CTRL=1)) == {}
+    assert faults(with_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1)).keys() == {"EKF2_EV_NOISE_MD"}
+    assert faults(replace(without, vehicle="plane")) == {}
 
 
 def test_check_autopilot_finds_an_old_px4():
-    assert wrong(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
+    assert faults(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
         "firmware": ()
     }
-    assert set(wrong(replace(PX4, version=None))) == {"firmware"}
-    assert wrong(replace(PX4, sends_mavlink1=True)) == {"port": ("MAV_PROTO_VER=2",)}
+    assert set(faults(replace(PX4, version=None))) == {"firmware"}
+    assert faults(replace(PX4, sends_mavlink1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
 @pytest.mark.parametrize(
@@ -246,21 +246,21 @@ def test_doctor_changes_are_on_the_how_to_pages():
     docs = Path(__file__).parents[3] / "docs/how-to"
     copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
     bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
-    for parameter, value in (change.split("=") for change in wrong(bare)["channel"]):
+    for parameter, value in (change.split("=") for change in faults(bare)["channel"]):
         assert re.search(rf"`{parameter}`.*\| {value} \|", copter)
-    for change in (*wrong(VISUAL)["EK3_SRCn_POSXY"], "VISO_TYPE=1"):
+    for change in (*faults(VISUAL)["EK3_SRCn_POSXY"], "VISO_TYPE=1"):
         assert f"`{change}`" in copter
     assert "EK3_SRC2_VELXY=6" not in copter
     unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
     changes = [
-        change for each in (unset, replace(PX4, parameters={})) for found in wrong(each).values() for change in found
+        change for each in (unset, replace(PX4, parameters={})) for found in faults(each).values() for change in found
     ]
     for parameter, value in (change.split("=") for change in (*changes, *RULES["px4"].port_changes(921_600))):
         assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
 
 
 @pytest.fixture
-def _quick(monkeypatch):
+def _listen_briefly(monkeypatch):
     monkeypatch.setattr(module, "LISTEN_S", 0.2)
 
 
@@ -273,18 +273,18 @@ def peer(link: str, **autopilot) -> AnsweringAutopilot:
     return AnsweringAutopilot(parse_link(link).number, messages=healthy_messages(), **autopilot)
 
 
-def findings_of(printed: str) -> dict[str, bool]:
+def parse_findings(printed: str) -> dict[str, bool]:
     found = (line.split(maxsplit=2) for line in printed.splitlines() if not line.startswith(" "))
     return {what: verdict == "ok" for verdict, what, _ in found}
 
 
 @pytest.mark.network
-@pytest.mark.usefixtures("_quick")
+@pytest.mark.usefixtures("_listen_briefly")
 def test_doctor_over_a_link_only_reads(link, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}) as autopilot:
         code = main(["doctor", "--link", link])
-    found = findings_of(capsys.readouterr().out)
+    found = parse_findings(capsys.readouterr().out)
     assert [what for what, ok in found.items() if not ok] == []
     assert code == 0
     assert list(tmp_path.iterdir()) == []
@@ -292,7 +292,7 @@ def test_doctor_over_a_link_only_reads(link, capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.network
-@pytest.mark.usefixtures("_quick")
+@pytest.mark.usefixtures("_listen_briefly")
 def test_doctor_reads_the_configuration_and_prints_json(link, capsys, tmp_path):
     config = tmp_path / "config.yaml"
     config.write_text(f"mavlink: {{link: '{link}', send_fixes: false}}\nlog: {{path: null}}\n")
@@ -309,22 +309,22 @@ def test_doctor_reads_the_configuration_and_prints_json(link, capsys, tmp_path):
 
 
 @pytest.mark.network
-@pytest.mark.usefixtures("_quick")
+@pytest.mark.usefixtures("_listen_briefly")
 def test_doctor_waits_for_a_frame_of_the_camera(link, capsys, tmp_path):
     config = tmp_path / "config.yaml"
     config.write_text(f"source: {{uri: 'tcp://127.0.0.1:{free_port()}'}}\nlog: {{path: null}}\n")
     with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}):
         assert main(["doctor", "--config", str(config), "--link", link]) == 1
-    found = findings_of(capsys.readouterr().out)
+    found = parse_findings(capsys.readouterr().out)
     assert [what for what, ok in found.items() if not ok] == ["frames"]
 
 
 @pytest.mark.network
-@pytest.mark.usefixtures("_quick")
+@pytest.mark.usefixtures("_listen_briefly")
 @pytest.mark.parametrize(("where", "code"), [("here", 1), ("udpout:no-such-host.invalid:14550", 2)])
 def test_doctor_checks_the_machine_without_an_autopilot(where, code, link, capsys):
     assert main(["doctor", "--link", link if where == "here" else where]) == code
-    found = findings_of(capsys.readouterr().out)
+    found = parse_findings(capsys.readouterr().out)
     assert not found["link"]
     assert "memory" in found
     assert "channel" not in found

@@ -7,7 +7,7 @@ import time
 import psutil
 import pytest
 from flight_process import cpu_s, ended, manager, simulated_autopilot, start, wait_for
-from flights import PLACES, STEP_DEG, of_kind
+from flights import PLACES, STEP_DEG, select
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.flight import startup
@@ -32,7 +32,7 @@ def test_run_sends_what_it_logs(fly, tmp_path):
         said = ended(run)
         seen = asked()
     lines = list(read_log(tmp_path / "flight.jsonl"))
-    queries, end = of_kind(lines, "query"), lines[-1]
+    queries, end = select(lines, "query"), lines[-1]
     assert [line["kind"] for line in (lines[0], end)] == ["start", "end"]
     assert len(queries) == end["queries"] == PLACES
     assert all(line["accepted"] for line in queries)
@@ -46,7 +46,7 @@ def test_run_sends_what_it_logs(fly, tmp_path):
     assert seen.fixes_accepted == end["mavlink"]["acks"]["ACCEPTED"] == seen.messages["COMMAND_INT"]
     # A line that says so was right, and so was the next; what waited for longer is told by the line of its answer.
     told = {line["query"] for line in queries if line["fix"]["sent"]}
-    answered = [line for line in of_kind(lines, "answer") if line["sent"]]
+    answered = [line for line in select(lines, "answer") if line["sent"]]
     assert [line["result"] for line in answered] == ["ACCEPTED"] * seen.fixes_accepted
     assert told <= {line["query"] for line in answered}
     assert len(answered) == len({line["query"] for line in answered})
@@ -69,7 +69,7 @@ def test_dry_run_sends_everything_but_fixes(fly, tmp_path):
     for name in ("HEARTBEAT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT", "ONBOARD_COMPUTER_STATUS"):
         assert seen.messages[name] > 0
     lines = list(read_log(tmp_path / "flight.jsonl"))
-    queries, start_line = of_kind(lines, "query"), lines[0]
+    queries, start_line = select(lines, "query"), lines[0]
     assert all(line["accepted"] for line in queries)
     assert not any(line["fix"]["sent"] for line in queries)
     assert {line["fix"]["why"]["code"] for line in queries} <= WITHHELD

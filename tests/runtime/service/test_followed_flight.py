@@ -1,7 +1,7 @@
 """`match.follow` of a flight."""
 
 import pytest
-from flights import of_kind
+from flights import select
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.flight.flightlog import read_log
@@ -25,4 +25,4 @@ def test_run_follows_with_confidence_and_without_a_sequence(recording, tmp_path,
         f"match: {match}\nlog: {{path: {log}}}\n"
     )
     assert main(["run", "--config", str(config)]) == 0
-    assert {"track" in line for line in of_kind(read_log(log), "query")} == {follows}
+    assert {"track" in line for line in select(read_log(log), "query")} == {follows}

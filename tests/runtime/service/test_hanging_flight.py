@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 from flight_process import manager, start
-from flights import of_kind
+from flights import select
 from loopback import PATIENCE_S, wait_until
 
 from edgevpr.runtime.flight.flightlog import read_log
@@ -24,7 +24,7 @@ END_S = 30.0  # it takes five; by far less than for ever, on a busy machine too
 
 
 @pytest.fixture
-def hanging(recording, tmp_path):
+def start_hanging_flight(recording, tmp_path):
     """Start a flight whose camera hangs in a step; returns it once it hangs."""
     flights = []
 
@@ -50,8 +50,8 @@ def hanging(recording, tmp_path):
 @pytest.mark.parametrize(
     ("step", "state"), [("open", "opening"), ("read", "lost"), ("pixels", "lost"), ("release", "lost")]
 )
-def test_run_reports_a_hanging_camera_and_ends(hanging, step, state, tmp_path):
-    flight = hanging(step)
+def test_run_reports_a_hanging_camera_and_ends(start_hanging_flight, step, state, tmp_path):
+    flight = start_hanging_flight(step)
     status = wait_until(
         lambda: (found := read_status(tmp_path / "status.json")) and state in found[0]["source"] and found
     )
@@ -60,12 +60,12 @@ def test_run_reports_a_hanging_camera_and_ends(hanging, step, state, tmp_path):
     assert flight.wait(END_S) == 0
     lines = list(read_log(tmp_path / "f.jsonl"))
     assert lines[-1]["kind"] == "end"
-    assert [line["condition"] for line in of_kind(lines, "source")][:1] == ["LOST"] * (state == "lost")
+    assert [line["condition"] for line in select(lines, "source")][:1] == ["LOST"] * (state == "lost")
 
 
-def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(hanging, tmp_path):
+def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(start_hanging_flight, tmp_path):
     with manager(tmp_path) as (listening, environment):
-        flight = hanging("main", **environment)
+        flight = start_hanging_flight("main", **environment)
         listening.settimeout(2.0)
         give_up_s = time.monotonic() + PATIENCE_S
         with suppress(TimeoutError):
@@ -74,7 +74,7 @@ def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(hanging, tmp_path)
     flight.terminate()
     assert flight.wait(END_S) == 1
     assert "ending its process" in flight.stderr.read()
-    assert of_kind(read_log(tmp_path / "f.jsonl"), "start")
+    assert select(read_log(tmp_path / "f.jsonl"), "start")
 
 
 @pytest.mark.network

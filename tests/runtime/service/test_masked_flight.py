@@ -11,7 +11,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 
-def shown(place, figures):
+def draw_display(place, figures):
     """The picture of a place behind a display: two panels of figures."""
     picture = textured(place, 240, 320)
     picture[:60], picture[190:] = 0, 0
@@ -21,7 +21,7 @@ def shown(place, figures):
 
 
 def test_mask_of_map_and_flight_excludes_a_display(tmp_path):
-    write_flight(tmp_path / "ref", [shown(place, "BAT 16.2V HOME 412m ALT") for place in range(4)])
+    write_flight(tmp_path / "ref", [draw_display(place, "BAT 16.2V HOME 412m ALT") for place in range(4)])
     allowed = np.full((240, 320), 255, np.uint8)
     allowed[:60], allowed[190:] = 0, 0
     cv2.imwrite(str(tmp_path / "mask.png"), allowed)
@@ -30,7 +30,7 @@ def test_mask_of_map_and_flight_excludes_a_display(tmp_path):
     assert main(["map", "build", settings["map"], *flags]) == 0
     walk = open_recogniser(load_config(None, settings), load_board("this"))
     with walk.place_map:
-        seen = [shown(2, figures) for figures in ("BAT 16.2V HOME 412m ALT", "RSSI 87")]
+        seen = [draw_display(2, figures) for figures in ("BAT 16.2V HOME 412m ALT", "RSSI 87")]
         same, other = (walk.step(Frame(image=image, name="", t_mono_s=0.0)) for image in seen)
     assert same.best.place.source_image == "2.png"
     assert other.best == same.best
