@@ -75,7 +75,7 @@ def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
-        raise ImageError(f"The image {path} cannot be read ({error.strerror}): make the file readable.") from error
+        raise ImageError(f"The image {path} cannot be read ({error.strerror}): choose a readable file.") from error
     except MemoryError:
         raise ImageError(f"{path} does not fit in the free memory: use a smaller image.") from None
     return decode_image(data, str(path), depth)

@@ -213,7 +213,7 @@ class LiveSource(Source):
         return opening is self._opening and not opening.is_cancelled
 
     def _handle_shot(self, opening: _Opening, shot: Shot | Refusal) -> None:
-        """Store or count what was read by an opening, unless the opening was abandoned."""
+        """Store or count a picture read by an opening, unless the opening was abandoned."""
         with self._changed:
             if not self._is_current(opening):
                 return

@@ -42,7 +42,7 @@ def load_mask(path: str | None) -> OverlayMask | None:
     allowed = grey >= _MIN_WHITE_LEVEL
     if (masked := 1 - allowed.mean()) > MAX_MASKED_FRACTION:
         raise UsageError(
-            f"{path} masks {masked:.0%} of the frame, but at most {MAX_MASKED_FRACTION:.0%} is allowed: add white."
+            f"{path} masks {masked:.0%} of the frame, but at most {MAX_MASKED_FRACTION:.0%} is allowed: mask less."
         )
     pixels = repr(allowed.shape).encode() + np.packbits(allowed).tobytes()
     return OverlayMask(allowed, hashlib.sha256(pixels).hexdigest())

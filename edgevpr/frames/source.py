@@ -189,7 +189,7 @@ def open_source(
 
         return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
     if not path.is_file():
-        raise SourceError(f"There is nothing at `{uri}`: choose {SOURCE_HELP}.")
+        raise SourceError(f"{uri} does not exist: choose {SOURCE_HELP}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: use the folder that contains it.")
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
@@ -228,7 +228,7 @@ def find_missing_cause(uri: str) -> str | None:
     if "://" in uri or is_program_uri(uri):
         return None
     if not Path(uri).exists():
-        return f"there is nothing at {uri}"
+        return f"{uri} does not exist"
     if not os.access(uri, os.R_OK):
         return f"this user may not read {uri}: add the user to the group that owns it, often `video`"
     return None

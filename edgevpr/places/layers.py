@@ -64,6 +64,6 @@ def read_layers(place_map: PlaceMap) -> Layers:
 
 
 def _find_nearest(footprints_m: Sequence[float], length_m: float | Doubles) -> Ints:
-    """Return the index of the footprint with the closest ratio to `length_m`, or to each of its lengths."""
+    """Return the index of the footprint that is closest, by ratio, to `length_m` or to each of its lengths."""
     log_ratios = np.subtract.outer(np.log(length_m), np.log(footprints_m))
     return np.asarray(np.abs(log_ratios).argmin(axis=-1))

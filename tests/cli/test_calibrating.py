@@ -83,7 +83,7 @@ def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, caps
     ("flags", "code", "said"),
     [
         (["--images", "FLIGHT/other"], 2, "pictures of only 0 places were found"),
-        (["--images", "FLIGHT/absent"], 1, "There is nothing at"),
+        (["--images", "FLIGHT/absent"], 1, "does not exist"),
         ([], 2, "Pass either --images"),
         (["--images", "FLIGHT/ref", "--positions", "FLIGHT/absent.csv"], 2, "absent.csv"),
     ],

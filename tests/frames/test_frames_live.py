@@ -303,10 +303,10 @@ def test_missing_device_is_awaited(name, tmp_path, monkeypatch):
     monkeypatch.setattr(source_module, "is_live", lambda uri: True)
     path = tmp_path / name
     source = open_source(str(path), live=True)
-    wait_until(lambda: source.state.startswith(f"there is nothing at {path}, reopening in "))
+    wait_until(lambda: source.state.startswith(f"{path} does not exist, reopening in "))
     assert source.condition is Condition.LOST
     path.write_text("v=0")
-    wait_until(lambda: not source.state.startswith(f"there is nothing at {path}"))
+    wait_until(lambda: not source.state.startswith(f"{path} does not exist"))
     source.close()
 
 
@@ -316,7 +316,7 @@ LIVE = ("udp://:5600", "udp://@239.0.0.1:5600", "rtsp://user:secret@host/path", 
 @pytest.mark.parametrize(
     ("uri", "live", "complaint"),
     [
-        ("missing.mp4", True, "There is nothing at `missing.mp4`: choose a folder of images, a video file, a camera"),
+        ("missing.mp4", True, "missing.mp4 does not exist: choose a folder of images, a video file, a camera"),
         *((uri, True, f"{uri} is not the address") for uri in ("rtmp://h/live", "rtsp:///a", "udp://h", "tcp://h:a")),
         *((uri, False, "live") for uri in LIVE),  # where the work has an end
     ],
