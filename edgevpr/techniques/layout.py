@@ -140,14 +140,14 @@ def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) ->
     padded = _pad_field(query, n)
     first = (padded.shape[1] - n) // 2
     steps = [(first - dy - y, first - dx - x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
-    inside = [(y, x) for y, x in steps if 0 <= y <= padded.shape[1] - n and 0 <= x <= padded.shape[1] - n]
-    if not inside:
+    windows = [(y, x) for y, x in steps if 0 <= y <= padded.shape[1] - n and 0 <= x <= padded.shape[1] - n]
+    if not windows:
         return 0.0
-    shifted = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
+    shifted = np.stack([padded[:, y : y + n, x : x + n] for y, x in windows])
     strength = (place**2).sum(axis=0)
-    scatter = ((shifted**2).sum(axis=1) * strength).sum(axis=(1, 2))
-    scatter = np.maximum(scatter, _MIN_SCATTER**2 * _measure_strength(query) * strength.sum())
-    scores = np.einsum("scij,cij->s", shifted, place) / (np.sqrt(scatter + _TINY) * n)
+    scatter_sq = ((shifted**2).sum(axis=1) * strength).sum(axis=(1, 2))
+    scatter_sq = np.maximum(scatter_sq, _MIN_SCATTER**2 * _measure_strength(query) * strength.sum())
+    scores = np.einsum("scij,cij->s", shifted, place) / (np.sqrt(scatter_sq + _TINY) * n)
     return float(np.clip(scores.max(), 0, 1))
 
 
@@ -157,9 +157,9 @@ def _compare_fields(grid: Grid, queries: list[Singles], packed: Bytes) -> Single
     shifted = [_shift_field(query, grid.side) for query in queries]
     fields = np.concatenate(shifted) if len(shifted) > 1 else shifted[0]  # a megabyte, so avoid a needless copy
     strengths = [(query**2).sum(axis=0, keepdims=True) for query in queries]
-    scatter = np.concatenate([_shift_field(strength, grid.side).sum(axis=1) for strength in strengths])
-    min_scatter = [_MIN_SCATTER**2 * float(strength.mean()) * grid.side**2 for strength in strengths]
-    fields /= np.sqrt(np.maximum(scatter, np.repeat(min_scatter, [len(query) for query in shifted])) + _TINY)[:, None]
+    scatter_sq = np.concatenate([_shift_field(strength, grid.side).sum(axis=1) for strength in strengths])
+    limits = [_MIN_SCATTER**2 * float(strength.mean()) * grid.side**2 for strength in strengths]
+    fields /= np.sqrt(np.maximum(scatter_sq, np.repeat(limits, [len(query) for query in shifted])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
     last_is_filled, used_fields = None, fields
     for start in range(0, len(packed), _ROWS_PER_PRODUCT):
