@@ -59,14 +59,17 @@ _SENT = {
 
 
 def write_page(work: Path) -> None:
-    """Write rig.json, rig.md and rig.jpg of the newest run of each scenario."""
+    """Write rig.json, rig.md and rig.jpg of the newest run of each scenario; figures of earlier runs without a folder
+    stay as they were."""
     flown = sorted(folder.name for folder in (work / "runs").iterdir() if "-" not in folder.name)
-    found = {name: _runs(work / "runs", name) for each in SCENARIOS for name in flown if scenario_of(name)[0] == each}
-    result = {**base.made_by(), "scenarios": {name: runs for name, runs in found.items() if runs}}
+    new = {name: runs for name in flown if (runs := _runs(work / "runs", name))}
+    kept, order = base.read("rig").get("scenarios", {}), [*SCENARIOS]
+    names = [name for name in {*kept, *new} if scenario_of(name)[0] in order]
+    names.sort(key=lambda name: (order.index(scenario_of(name)[0]), name))
+    result = {**base.made_by(), "scenarios": {name: kept.get(name, {}) | new.get(name, {}) for name in names}}
     base.write("rig", result, page(result))
-    flown = [name for name, runs in result["scenarios"].items() if "with" in runs]
-    _draw(work, list(result["scenarios"]), RESULTS / "rig.jpg")
-    draw_claims([work / "runs" / name for name in flown], RESULTS / "rig-claims.jpg")
+    _draw(work, list(new), RESULTS / "rig.jpg")
+    draw_claims([work / "runs" / name for name, runs in new.items() if "with" in runs], RESULTS / "rig-claims.jpg")
 
 
 def _runs(runs: Path, name: str) -> dict[str, Row]:
