@@ -31,9 +31,11 @@ MIN_PROOF = 0.09  # sum of such motions that proves images frozen: a single rese
 _MAX_SINGLE_MOTION = 0.04  # limit for one rotation, or one repeated image
 _PROOF_WINDOW_S = 20.0
 _MIN_FROZEN_S = 2.5  # of unchanged images, or between an image and its repetition
-# This many consecutive repeated images in flight are sufficient proof: on a route that is flown again, at 500 m
-# with a gimbal, one image in five equals an earlier one to within the resolution.
+# This many consecutive repeated images in flight are sufficient proof, unless the aircraft has come back: on a lap that
+# takes whole seconds, one image after another equals that of the lap before. A plane's dead reckoning was up to 30 % of
+# the distance wrong.
 _MIN_REPEATS = 8
+_MAX_RETURN_FRACTION = 0.5  # of the distance flown: an aircraft that is nearer to where it was has come back
 _ROTATION_ERROR_DEG = 2.0  # due to attitude and time of the frame
 _SPEED_ERROR_M_S = 2.0  # a lower speed counts as hovering
 _PATH_DRIFT_M_S = 6.0  # of a path over a minute, due to changing wind
@@ -99,12 +101,18 @@ def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedImage:
     """An image with the autopilot's report at its time (`vehicle`; None: no report). `path_m` (2,): displacement since
-    the start of the flight, integrated from velocities, metres east and north."""
+    the start of the flight, integrated from velocities, metres east and north; `distance_m`: its length."""
 
     image: CoarseImage
     t_s: float
     vehicle: Vehicle | None
     path_m: Doubles
+    distance_m: float
+
+    def has_returned_to(self, earlier: "TimedImage") -> bool:
+        """Return True if the aircraft has flown away from an earlier image and come back."""
+        moved_m = float(np.hypot(*(self.path_m - earlier.path_m)))
+        return moved_m < _MAX_RETURN_FRACTION * (self.distance_m - earlier.distance_m)
 
 
 class FrozenWatch:
@@ -153,15 +161,16 @@ class FrozenWatch:
         return self.reason
 
     def _locate_image(self, image: CoarseImage, t_s: float, vehicle: Vehicle | None) -> TimedImage:
-        last, path_m = self._newest, np.zeros(2)
+        last, path_m, distance_m = self._newest, np.zeros(2), 0.0
         if last:
-            path_m = last.path_m
+            path_m, distance_m = last.path_m, last.distance_m
             last_velocity_m_s, velocity_m_s = _read_velocity(last.vehicle), _read_velocity(vehicle)
             if last_velocity_m_s and velocity_m_s and 0 < t_s - last.t_s <= _MAX_STEP_S:
-                path_m = path_m + (t_s - last.t_s) * np.mean([last_velocity_m_s, velocity_m_s], axis=0)
+                step_m = (t_s - last.t_s) * np.mean([last_velocity_m_s, velocity_m_s], axis=0)
+                path_m, distance_m = path_m + step_m, distance_m + float(np.hypot(*step_m))
             if _has_jumped(last, vehicle, t_s):
                 self._remembered.clear()
-        return TimedImage(image=image, t_s=t_s, vehicle=vehicle, path_m=path_m)
+        return TimedImage(image=image, t_s=t_s, vehicle=vehicle, path_m=path_m, distance_m=distance_m)
 
     def _start_run(self, now: TimedImage) -> None:
         self._run_start, self._rotation_start, self._travel_motion = now, now.vehicle, 0.0
@@ -200,7 +209,8 @@ class FrozenWatch:
             return
         velocity_m_s = _read_velocity(now.vehicle)
         is_flying = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
-        if is_flying and self._optics.looks_down:  # the horizon ahead looks the same for a long time
+        # The horizon ahead looks the same for a long time.
+        if is_flying and self._optics.looks_down and not now.has_returned_to(earlier):
             self._repeats_in_a_row += 1
         rotation_motion = self._optics.compute_rotation_motion(earlier.vehicle, now.vehicle)
         motion = max(rotation_motion, self._compute_travel_motion(earlier, now, _PATH_DRIFT_M_S))

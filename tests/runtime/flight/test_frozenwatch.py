@@ -86,6 +86,16 @@ def test_frozen_watch_refuses_a_repeated_clip_in_flight(ground, is_in_order):
     assert flown.notes == [str(Reason(ReasonCode.IMAGES_REPEATED))]
 
 
+def test_frozen_watch_accepts_laps_of_whole_seconds(ground):
+    """A copter that does not turn flies a square three times: each image of a lap is that of the lap before."""
+    flown, sides = CameraFlight(ground), [(1, 0)] * 10 + [(0, 1)] * 10 + [(-1, 0)] * 10 + [(0, -1)] * 10
+    east_m, north_m = 160.0, 80.0
+    for east, north in 3 * sides:
+        picture = flown.photograph(east_m, north_m)
+        assert flown.see(picture, velocity_m_s=(6.0 * east, 6.0 * north)) is None
+        east_m, north_m = east_m + 6.0 * east, north_m + 6.0 * north
+
+
 def test_frozen_watch_refuses_a_clip_whose_turns_are_not_flown(ground):
     flown = CameraFlight(ground)
     turns = [30.0 * number for number in range(12)]
