@@ -117,7 +117,7 @@ def ask(name: str, dataset: Dataset) -> list[Answer]:
         for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
             ranking = walk.step(walks.frame(query.path)).ranking
             found = (np.empty(0, int), np.empty(0)) if ranking is None else (ranking.slots, ranking.scores)
-            of = [np.isin(dataset.references, list(names)) for names in (query.right, query.ignored)]
+            of = [np.isin(dataset.references, list(names)) for names in (query.correct, query.ignored)]
             asked.append((*found, *of))
     return asked
 

@@ -111,11 +111,11 @@ def kind_of_match(found: str, query: ScoredQuery | None, references: Sequence[st
     foreign."""
     if query is None:
         return "foreign"
-    if found in query.right:
+    if found in query.correct:
         return "right"
     if found in query.ignored:
         return "ignored"
-    known = np.flatnonzero([each in query.right or each in query.ignored for each in references])
+    known = np.flatnonzero([each in query.correct or each in query.ignored for each in references])
     return "wrong" if outside_neighbourhood(index, references.index(found), known, 0.0).all() else "beside"
 
 

@@ -83,7 +83,7 @@ def _bare(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Gene
     for number in rng.choice(len(dataset.queries), queries, replace=queries > len(dataset.queries)):
         query = dataset.queries[number]
         for _, image in yield_spoilt(seed + int(number), read_image(query.path)):
-            yield "spoilt", image, query.right | query.ignored
+            yield "spoilt", image, query.correct | query.ignored
     for kind, same_camera in (("of other sites", True), ("of the other camera", False)):
         for image in _foreign(dataset, folders, count, rng, same_camera):
             yield kind, image, frozenset()
@@ -91,7 +91,7 @@ def _bare(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Gene
 
 def _behind(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Generator, draw: Draw) -> Iterator[Asked]:
     for query in dataset.queries[:: -(-len(dataset.queries) // count)]:
-        yield "its own", draw(read_image(query.path)), query.right | query.ignored
+        yield "its own", draw(read_image(query.path)), query.correct | query.ignored
     for image in _foreign(dataset, folders, count, rng, same_camera=True):
         yield "of other sites", draw(image), frozenset()
 

@@ -36,11 +36,11 @@ def measure(name: str) -> base.Row:
             event = walk.step(walks.frame(query.path))
             if event.accepted:
                 found = event.best.place.source_image
-                is_right = found in query.right or found in query.ignored
+                is_right = found in query.correct or found in query.ignored
                 row["right" if is_right else "wrong"] += 1
                 landmarks = with_landmarks.step(walks.frame(query.path)).evidence.landmarks
                 row["unproven"] += is_right and landmarks <= np.log1p(CHANCE_INLIERS)
-            right_slots = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
+            right_slots = [slot for slot in slots if dataset.references[slot] in {*query.correct, *query.ignored}]
             away = [outside_neighbourhood(index, slot, slots, 0.0, max_slots=beside) for slot in right_slots]
             kept = np.all(away, axis=0)
             without = walks.walk(place_map, index.select(kept), technique, rule=walk.rule)

@@ -120,7 +120,7 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
         if not label.endswith(FORMS)
     ]
     reached = [[name, *cells] for name, row in shown for cells in tables.make_rows(result(row), _REACHED)]
-    costs = [(name, row, *tables.make_rows(result(row), tables.COSTS, both=False)) for name, row in shown]
+    costs = [(name, row, *tables.make_rows(result(row), tables.COSTS, include_in_map=False)) for name, row in shown]
     paid = [[name, *cells, row["cpu"]] for name, row, cells in costs if name in _PAID]
     old = [content["set"] for content in contents if any("unscored" not in row for row in _rows(content))]
     weights = sorted({each.weights for rows in results.values() for each in rows if each.weights})

@@ -122,7 +122,7 @@ def _build(camera: str) -> None:
 def chosen(dataset: Dataset, names: list[str], count: int) -> set[str]:
     """Choose the places of a map of `count`: the same first ones at every size (see the top of this file)."""
     rng = np.random.default_rng(0)
-    cover = covering([query.right for query in dataset.queries])
+    cover = covering([query.correct for query in dataset.queries])
     others = [name for name in dataset.references if name not in set(cover)]
     strangers = sorted(set(names) - set(dataset.references))
     for each in (others, strangers):
@@ -173,11 +173,11 @@ def measured(camera: str, count: int) -> Row:
             if number == 0:
                 continue
             counted = next((name for name in ranked if name not in query.ignored), None)
-            hits.append(counted in query.right)
+            hits.append(counted in query.correct)
             if counted and not hits[-1]:
                 wrong_by[_whereabouts(counted, query.path.name, sites)] += 1
             accepted += event.accepted
-            if event.accepted and ranked[0] not in query.right | query.ignored:
+            if event.accepted and ranked[0] not in query.correct | query.ignored:
                 is_beside = _is_beside(ranked[0], query, dataset)
                 beside += is_beside
                 wrong += [] if is_beside else [(query.path.name, ranked[0])]
@@ -214,7 +214,7 @@ def _is_beside(place: str, query: ScoredQuery, dataset: Dataset) -> bool:
     """Tell whether a place is at most two pictures before or after one that is right, in the order of the site."""
     if place not in dataset.references:
         return False
-    known = [dataset.references.index(name) for name in query.right | query.ignored]
+    known = [dataset.references.index(name) for name in query.correct | query.ignored]
     return min(abs(dataset.references.index(place) - at) for at in known) <= _BESIDE
 
 

@@ -211,7 +211,7 @@ def _ahead(folder: Path) -> Iterator[Start]:
             covered=np.ones(image.shape[:2], bool),
             onto=np.eye(3),
             size=image.shape[1::-1],
-            right=query.right,
+            right=query.correct,
             ignored=query.ignored,
             lies={},
         )

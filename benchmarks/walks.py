@@ -34,7 +34,7 @@ from edgevpr.techniques import create
 def dataset_of(folder: Path) -> Dataset:
     """Read a set; of its queries those whose place is in the map: how foreign ones fare has benchmarks of its own."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
-    return replace(dataset, queries=tuple(query for query in dataset.queries if query.right))
+    return replace(dataset, queries=tuple(query for query in dataset.queries if query.correct))
 
 
 def config(**keys: object) -> Config:

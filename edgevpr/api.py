@@ -100,9 +100,9 @@ class Map:
         overrides = {"map": _to_path(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
         settings = load_config(config, overrides)
         source = settings.source
-        known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
+        known_fields = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
         board = resolve_board(load_board(settings.board), source, settings.memory)
-        self._recogniser = open_recogniser(settings, board, known=known, tracks_flight=follow)
+        self._recogniser = open_recogniser(settings, board, known=known_fields, tracks_flight=follow)
         is_nadir = self._recogniser.technique.spec.looks_down
         self._needs_height = source.fov_deg is not None or (source.lens is not None and is_nadir)
         self._is_open, self._threads = True, ThreadpoolController()
@@ -218,10 +218,10 @@ def build(
     settings = load_config(config, {"source.camera": camera})
     show = text.progress if progress is None else _wrap_progress(progress)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
-        made = make_map(plan, settings, lambda error: _log.warning("%s", error), show)
-    for sentence in made.not_done:
+        built_map = make_map(plan, settings, lambda error: _log.warning("%s", error), show)
+    for sentence in built_map.not_done:
         _log.warning("%s", sentence)
-    return made
+    return built_map
 
 
 def _wrap_progress(progress: Progress) -> Any:

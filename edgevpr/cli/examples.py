@@ -65,5 +65,5 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
 
 def format_examples(command: str) -> str:
     """Return the examples for a command, such as `map build`, as the text below its help."""
-    lines = [f"  # {text}\n  edgevpr {command} {rest}".rstrip() for text, rest in EXAMPLES[command]]
+    lines = [f"  # {text}\n  edgevpr {command} {arguments}".rstrip() for text, arguments in EXAMPLES[command]]
     return "\n".join(["examples:", *lines])

@@ -80,14 +80,14 @@ def run_match(args: Namespace) -> int:
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.techniques.card import describe_weights
 
-    config, known = make_config(args, args.config, map=args.map), parse_known_fields(args.known)
+    config, known_fields = make_config(args, args.config, map=args.map), parse_known_fields(args.known)
     board = resolve_board(load_board(config.board), config.source, config.memory)
-    recogniser = open_recogniser(config, board, known=known, tracks_flight=args.follow)
+    recogniser = open_recogniser(config, board, known=known_fields, tracks_flight=args.follow)
     matches = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=to_path(args.positions), live=False)
-    if known:
-        _require_known(args, known, recogniser)
+    if known_fields:
+        _require_known(args, known_fields, recogniser)
     frames = read_to_end(source, lambda error: skip_image(error, unusable))
     place_map = recogniser.place_map
     is_calibrated = place_map.calibration is not None
@@ -97,20 +97,20 @@ def run_match(args: Namespace) -> int:
             skip_image(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         matches.append(format_match(event) | {"calibrated": is_calibrated})
-        if known:
+        if known_fields:
             matches[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(format_matches(matches))
     if not is_calibrated and list_evidence_kinds(place_map.spec):
         lines.append(f"The map is {explain_not_calibrated(len(place_map))}.")
-    if known:
-        lines.append(f"Known for each query: {','.join(known)}.")
+    if known_fields:
+        lines.append(f"Known for each query: {','.join(known_fields)}.")
     if weights := describe_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     print_result(matches, args.json, "\n".join(lines))
     return report_unusable(unusable)
 
 
-def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:
+def _require_known(args: Namespace, fields: Sequence[str], recogniser: "Recogniser") -> None:
     """Raise UsageError if no query, or no place of the map, has the data that --known lists."""
     from edgevpr.frames.positions import find_track, read_track
     from edgevpr.frames.source import read_tags
@@ -122,7 +122,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     else:
         table = positions or find_track(source)
         queries = list(read_track(table).tags) if table else []
-    if problem := explain_why_unusable(known, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
+    if problem := explain_why_unusable(fields, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
         raise UsageError(problem)
 
 

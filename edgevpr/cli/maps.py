@@ -161,16 +161,16 @@ def run_map_build(args: Namespace) -> int:
         calibrate=args.calibrate,
     )
     unusable: list[ImageError] = []
-    made = make_map(plan, config, lambda error: skip_image(error, unusable), progress)
+    built_map = make_map(plan, config, lambda error: skip_image(error, unusable), progress)
     parts = {
-        "covered": made.covered and asdict(made.covered),
-        "refined": made.refined and asdict(made.refined),
-        "calibration": made.calibration and made.calibration.figures(),
-        "not_done": made.not_done,
+        "covered": built_map.covered and asdict(built_map.covered),
+        "refined": built_map.refined and asdict(built_map.refined),
+        "calibration": built_map.calibration and built_map.calibration.figures(),
+        "not_done": built_map.not_done,
     }
-    fields = {"map": args.map, "technique": made.technique, "places": made.places, **asdict(made.result)}
+    fields = {"map": args.map, "technique": built_map.technique, "places": built_map.places, **asdict(built_map.result)}
     fields |= {name: part for name, part in parts.items() if part}
-    print_result(fields, args.json, format_build(args.map, made, args.orthophoto is not None))
+    print_result(fields, args.json, format_build(args.map, built_map, args.orthophoto is not None))
     return report_unusable(unusable)
 
 

@@ -1,5 +1,4 @@
-"""`edgevpr simulate` writes the images of a simulated flight; `edgevpr demo` demonstrates all steps from map to
-match."""
+"""`edgevpr simulate` writes the images of a simulated flight; `edgevpr demo` shows all steps from map to match."""
 
 from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
@@ -25,13 +24,13 @@ def add(commands: Any) -> None:
     flight.add_argument("--which", choices=("map", "query"), help="map (default): mapping flight; query: later flight")
     text = "random seed of landscape and motion (default: 1)"
     flight.add_argument("--seed", type=_parse_seed, default=1, metavar="N", help=text)
-    over = flight.add_argument_group("over an orthophoto")
-    over.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")
-    over.add_argument(
+    orthophoto = flight.add_argument_group("over an orthophoto")
+    orthophoto.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")
+    orthophoto.add_argument(
         "--track", metavar="FILE", help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]"
     )
     for name, (*_, text) in _NUMBER_FLAGS.items():
-        over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
+        orthophoto.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
     demo = add_command(commands, "demo", run_demo, "map a generated flight, match a later one, and draw the result")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
@@ -63,8 +62,8 @@ def run_simulate_flight(args: Namespace) -> int:
         if value is not None and not low <= value <= high:  # false for NaN
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}, but must be between {low:g} and {high:g}.")
     shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
-    taken = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
-    if not (written := sum(1 for _ in progress(taken, len(shots), "flying"))):
+    image_names = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
+    if not (written := sum(1 for _ in progress(image_names, len(shots), "flying"))):
         raise UsageError(f"{args.orthophoto} covers no complete image along {args.track}: no images were written.")
     print(f"{args.out}: {written} images in images/, their positions in positions.csv")
     if beyond := len(shots) - written:

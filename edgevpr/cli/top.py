@@ -15,7 +15,7 @@ from edgevpr.core.text import escape_unprintable, format_probability
 _STATUS_FILE = "/run/edgevpr/status.json"
 _REFRESH_S = 1.0  # the flight writes its status once a second
 _LATE_STATUS_S = 2.5  # a warning is shown for an older status; a slow frame may delay one
-_STALE_STATUS_S = 10.0  # --once takes the flight for killed if its status is older
+_STALE_STATUS_S = 10.0  # --once assumes that a flight with an older status was killed
 _COARSE_AGE_S = 3.0  # the age of older pictures is shown in whole seconds
 _CLEAR = "\x1b[H\x1b[J"
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names

@@ -29,10 +29,11 @@ _OTHER_SEASON_NOTE = (
 _MAX_DIFFERENCES = 20  # maximum number of replay differences printed
 
 
-def format_build(path: str, made: "BuiltMap", from_orthophoto: bool) -> Iterator[str]:
-    """Yield what `map build` has made, and what to expect from the map. `from_orthophoto`: it was cut from one."""
-    result = made.result
-    yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in total"
+def format_build(path: str, built_map: "BuiltMap", from_orthophoto: bool) -> Iterator[str]:
+    """Yield what `map build` has built, and what to expect from the map. `from_orthophoto`: it was cut from one."""
+    result = built_map.result
+    places = f"{result.added} places added ({result.without_position} without a position)"
+    yield f"{path}: {places}, {built_map.places} in total"
     if result.already_here:
         yield f"  {result.already_here} images were already in the map"
     if result.tilted:
@@ -47,14 +48,14 @@ def format_build(path: str, made: "BuiltMap", from_orthophoto: bool) -> Iterator
         yield f"  {result.white} of the places are at least a third white: clouds and snow do not last"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to limit the gaps"
-    if made.refined:
-        yield from format_refinement(path, made.refined)
-    if made.calibration:
-        yield f"expect: {made.calibration.described()}"
+    if built_map.refined:
+        yield from format_refinement(path, built_map.refined)
+    if built_map.calibration:
+        yield f"expect: {built_map.calibration.described()}"
         if from_orthophoto:
             yield f"  {_OTHER_SEASON_NOTE}"
-    yield from (f"  {sentence}" for sentence in made.not_done)
-    if made.places and not made.with_position:
+    yield from (f"  {sentence}" for sentence in built_map.not_done)
+    if built_map.places and not built_map.with_position:
         yield f"{path}: {NO_POSITIONS_NOTE}"
 
 
@@ -134,8 +135,8 @@ def format_replay(replay: "ReplayResult", lines: "LineComparison", packets: "Pac
 
 
 def _limit_differences(texts: list[str]) -> list[str]:
-    more = [f"... and {len(texts) - _MAX_DIFFERENCES} more (--json has all)"] if len(texts) > _MAX_DIFFERENCES else []
-    return texts[:_MAX_DIFFERENCES] + more
+    omitted = len(texts) - _MAX_DIFFERENCES
+    return texts[:_MAX_DIFFERENCES] + ([f"... and {omitted} more (--json has all)"] if omitted > 0 else [])
 
 
 def _format_difference(difference: dict[str, Any]) -> str:

@@ -46,12 +46,12 @@ def append_bytes(file: BinaryIO, data: bytes) -> None:
     """Append all of `data`. If that fails, truncate the file to its old length if possible."""
     end = file.seek(0, os.SEEK_END)
     try:
-        rest = memoryview(data)
-        while rest:  # a nearly full disk accepts a part, and only the next write fails
-            written = file.write(rest)
+        remaining = memoryview(data)
+        while remaining:  # a nearly full disk accepts a part, and only the next write fails
+            written = file.write(remaining)
             if not written:  # for example a stopped terminal
                 raise OSError(errno.EAGAIN, "it cannot accept more data at the moment")
-            rest = rest[written:]
+            remaining = remaining[written:]
     except OSError:
         with suppress(OSError):
             file.truncate(end)

@@ -273,29 +273,29 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
 
 
 def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
-    kind, what = _get_class(hint), f"{where}: `{name}`"
+    kind, subject = _get_class(hint), f"{where}: `{name}`"
     limits: Any = rules.limits
     if value is None and isinstance(hint, types.UnionType):
         return None
     if is_dataclass(kind):
         if not isinstance(value, dict):
-            raise ConfigError(f"{what} must be a section: indent its keys below it.")
+            raise ConfigError(f"{subject} must be a section: indent its keys below it.")
         return build(kind, value, where, f"{name}.")
     if value is None:
-        raise ConfigError(f"{what} has no value: add one.")
+        raise ConfigError(f"{subject} has no value: add one.")
     if isinstance(value, int) and abs(value) > _MAX_INTEGER:
-        raise ConfigError(f"{what} has too many digits: use a smaller number.")
+        raise ConfigError(f"{subject} has too many digits: use a smaller number.")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str) and _NOT_IN_NAMES.search(value):
-        raise ConfigError(f"{what} contains a character that no file name can have ({value!a:.60}): remove it.")
+        raise ConfigError(f"{subject} contains a character that no file name can have ({value!a:.60}): remove it.")
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ConfigError(f"{what} must be {_TYPE_NAMES.get(kind, kind)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
+        raise ConfigError(f"{subject} must be {_TYPE_NAMES.get(kind, kind)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
     if limits and not limits[0] <= value <= limits[1]:
-        raise ConfigError(f"{what} is {value:g}, but must be between {limits[0]:g} and {limits[1]:g}.")
+        raise ConfigError(f"{subject} is {value:g}, but must be between {limits[0]:g} and {limits[1]:g}.")
     if rules.choices and value not in rules.choices:
         allowed = f"{', '.join(rules.choices[:-1])} or {rules.choices[-1]}"
-        raise ConfigError(f"{what} is `{value:.{_MAX_VALUE_CHARS}}`, but must be {allowed}.")
+        raise ConfigError(f"{subject} is `{value:.{_MAX_VALUE_CHARS}}`, but must be {allowed}.")
     return value
 
 

@@ -28,8 +28,8 @@ def list_model_folders() -> tuple[Path, ...]:
     EDGEVPR_MODELS, else edgevpr/models in XDG_DATA_HOME or ~/.local/share), and the shipped one."""
     # Without a home folder (a service may have none) "~" is not expanded, so no such folder is found.
     data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")
-    own = os.environ.get("EDGEVPR_MODELS") or os.path.join(data, "edgevpr", "models")
-    return Path(own), find_shipped("models")
+    user_folder = os.environ.get("EDGEVPR_MODELS") or os.path.join(data, "edgevpr", "models")
+    return Path(user_folder), find_shipped("models")
 
 
 def find_model(file: str) -> Path | None:

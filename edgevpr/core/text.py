@@ -27,8 +27,8 @@ _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _LINE_COLUMNS = 120
 _TERMINAL_COLUMNS = 79
-_MAX_ODDS_WRONG = 1e-3  # smaller error probabilities are shown as odds, because they would look equal in per cent
-_MIN_WRONG = 1e-6
+_MAX_P_WRONG_AS_ODDS = 1e-3  # smaller error probabilities are shown as odds, because they would look equal in per cent
+_MIN_P_WRONG = 1e-6
 _MAX_SILENCE_S = 5.0  # a progress line is written at least this often
 _MIN_ESTIMATE_S = 10.0  # the remaining time is shown only if it and the time since the start are at least this long
 
@@ -200,10 +200,10 @@ def show_wait(text: str, stream: TextIO | None = None) -> None:
 
 def format_probability(probability: float) -> str:
     """Format the probability of being right: "98.1 %" or, from 99.9 %, "1 in 3,000 wrong" (at most 1 in 1,000,000)."""
-    wrong = max(1 - probability, _MIN_WRONG)
-    if not wrong <= _MAX_ODDS_WRONG:  # NaN as well
+    p_wrong = max(1 - probability, _MIN_P_WRONG)
+    if not p_wrong <= _MAX_P_WRONG_AS_ODDS:  # NaN as well
         return f"{100 * probability:.1f} %"
-    return f"1 in {float(f'{1 / wrong:.1g}'):,.0f} wrong"
+    return f"1 in {float(f'{1 / p_wrong:.1g}'):,.0f} wrong"
 
 
 def format_offset(east_m: float, north_m: float) -> str:

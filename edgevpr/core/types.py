@@ -63,7 +63,7 @@ class Vehicle:
     `position_sd_m` per axis (also None if the autopilot does not trust its position).
     `heading_deg`: compass direction of the nose, 0..360. `t_received_s`: arrival of the report, on the frames' clock.
     `has_gps`: a GPS receiver had a 3D fix near the estimated position at that time. If False, the position may be
-    wrong: an autopilot goes on reporting its estimate long after it has lost GPS.
+    wrong: an autopilot keeps reporting its estimate long after it has lost GPS.
     `roll_deg`, `pitch_deg`: positive for right wing down and for nose up; `tilt_rate_deg_s`: rate of both together.
     `height_m`: above ground; `height_doubt_m`: by how much its sources disagree. `velocity_m_s`: over ground (east,
     north). `sink_m_s`: velocity down. `innovation_ratio`: innovation of measured positions over the filter's gate;

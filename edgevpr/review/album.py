@@ -204,10 +204,10 @@ def embed_pictures(
     from edgevpr.frames.images import encode_small_webp
 
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
-    every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(budget_bytes))))
-    keys = list(dict.fromkeys(key for step in steps[::every] for key in step if albums[key[0]]))
+    interval = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(budget_bytes))))
+    keys = list(dict.fromkeys(key for step in steps[::interval] for key in step if albums[key[0]]))
     pictures: dict[Key, str] = {}
-    is_incomplete = every > 1
+    is_incomplete = interval > 1
     for number, (album, name) in enumerate(progress(keys, len(keys), "pictures")):
         image = albums[album].find_image(name)
         if image is None:

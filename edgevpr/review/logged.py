@@ -116,9 +116,9 @@ def read_flight(path: str | Path) -> LoggedFlight:
                 queries[query.name] = query
                 flight.queries.append(query)
             case "answer":
-                if (answered := queries.get(get_text(line, "query") or "")) and answered.fix:
-                    answered.fix.outcome = _read_outcome(line, line.get("result"))
-                    answered.fix.why = read_reason(line.get("why")) or answered.fix.why
+                if (answered_query := queries.get(get_text(line, "query") or "")) and answered_query.fix:
+                    answered_query.fix.outcome = _read_outcome(line, line.get("result"))
+                    answered_query.fix.why = read_reason(line.get("why")) or answered_query.fix.why
             case "unusable":
                 flight.unusable += 1
             case "between":

@@ -119,13 +119,13 @@ def _read_frame(folder: Path, number: int) -> Image:
 
 def _drop_unknown_settings(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the settings of a recorded flight without those that this version no longer has, with a warning."""
-    kept, known = {}, {key.name for key in list_keys()}
+    settings, known_names = {}, {key.name for key in list_keys()}
     for name, value in config.items():
         key_name = f"{prefix}{name}"
-        if key_name in known:
-            kept[name] = value
+        if key_name in known_names:
+            settings[name] = value
         elif isinstance(value, dict):
-            kept |= {name: section} if (section := _drop_unknown_settings(value, f"{key_name}.")) else {}
+            settings |= {name: section} if (section := _drop_unknown_settings(value, f"{key_name}.")) else {}
         elif value not in (None, False):
             _log.warning("the flight had the setting `%s`, which this version of edgevpr does not recognise", key_name)
-    return kept
+    return settings

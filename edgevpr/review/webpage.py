@@ -141,9 +141,9 @@ def make_page(
     content["groups"] = [(group, colours[group], count) for group, count in counts.most_common()]
     numbers = {group: number for number, (group, *_) in enumerate(content["groups"])}
     rows = [_serialise_step(step, drawing, numbers) for step in steps]
-    if (every := -(-len(_dump(rows)) // _MAX_TEXT_BYTES)) > 1:
-        steps, rows = steps[::every], rows[::every]
-        notes.append(f"The page would be too large with all steps: one in {every} is shown.")
+    if (interval := -(-len(_dump(rows)) // _MAX_TEXT_BYTES)) > 1:
+        steps, rows = steps[::interval], rows[::interval]
+        notes.append(f"The page would be too large with all steps: one in {interval} is shown.")
     subset = places[:: -(-len(places) // _MAX_PLACES) or 1]
     keys = [[picture[:2] for picture in step.pictures] for step in steps]
     keys += [[("ground", place.source_image)] for place in subset if place.pose]

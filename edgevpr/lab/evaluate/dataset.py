@@ -34,11 +34,11 @@ GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuery:
-    """A query that is scored: the `path` of its image, the file names of the correct references, `right` (none: its
+    """A query that is scored: the `path` of its image, the file names of the `correct` references (none: its
     place is not in the map), and those of the `ignored` ones, where a match counts as neither correct nor wrong."""
 
     path: Path
-    right: frozenset[str]
+    correct: frozenset[str]
     ignored: frozenset[str]
 
 
@@ -92,11 +92,11 @@ def read_truth(path: str | Path) -> GroundTruth:
         name = row["query_file"]
         if name in truth:
             raise UsageError(f"{where}: query `{name}` already has a row: keep one row with all its ref_files.")
-        right, loose = (frozenset(row.get(key, "").split()) for key in ("ref_files", "ref_files_loose"))
+        correct, loose = (frozenset(row.get(key, "").split()) for key in ("ref_files", "ref_files_loose"))
         status = row.get("status", "ok")
-        if right and status == "novel":
+        if correct and status == "novel":
             raise UsageError(f"{where}: query `{name}` is `novel` but has ref_files: remove them, or write `ok`.")
-        truth[name] = (right, loose - right) if status in _SCORED_STATUSES else None
+        truth[name] = (correct, loose - correct) if status in _SCORED_STATUSES else None
     return truth
 
 

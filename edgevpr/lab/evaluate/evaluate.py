@@ -256,19 +256,19 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
     discarded = event.salience is not None and event.salience.reason is not None
     ranking = None if discarded else event.ranking
     slots = ranking.slots if ranking else np.empty(0, np.intp)
-    right, ignored = (np.array([name in names for name in references]) for names in (query.right, query.ignored))
+    correct, ignored = (np.array([name in names for name in references]) for names in (query.correct, query.ignored))
     scored = np.flatnonzero(~ignored[slots])
-    wrong = event.accepted and not (right | ignored)[slots[0]]
-    is_elsewhere = wrong and outside_neighbourhood(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
+    wrong = event.accepted and not (correct | ignored)[slots[0]]
+    is_elsewhere = wrong and outside_neighbourhood(index, slots[0], np.flatnonzero(correct | ignored), 0.0).all()
     return QueryAnswer(
         query=query.path.name,
-        has_match=bool(query.right),
+        has_match=bool(query.correct),
         found=references[slots[scored[0]]] if len(scored) else None,
         score=float(ranking.scores[scored[0]]) if ranking and len(scored) else -math.inf,
-        first_right=metrics.rank_of_first_correct(slots[scored], right),
+        first_right=metrics.rank_of_first_correct(slots[scored], correct),
         accepted=event.accepted,
         accepted_wrong=bool(wrong),
-        accepted_off_map=bool(wrong and not query.right),
+        accepted_off_map=bool(wrong and not query.correct),
         accepted_elsewhere=bool(is_elsewhere),
         discarded=discarded,
         encoding=event.steps.encoding,

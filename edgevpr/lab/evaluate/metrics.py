@@ -96,10 +96,10 @@ class TechniqueResult(Quality):
     pcu: float | None = None
 
 
-def rank_of_first_correct(ranked: np.ndarray, right: np.ndarray) -> float:
+def rank_of_first_correct(ranked: np.ndarray, correct: np.ndarray) -> float:
     """Return the rank, from 0, of the first correct reference; infinite if there is none. `ranked` are the indices of
-    references, best first. `right`, bool (references,), is True for correct references."""
-    hits = np.flatnonzero(right[ranked])
+    references, best first. `correct`, bool (references,), is True for correct references."""
+    hits = np.flatnonzero(correct[ranked])
     return float(hits[0]) if len(hits) else math.inf
 
 
@@ -144,12 +144,12 @@ def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
     """Compute the area under the ROC curve: the probability that a correct match scores higher than a wrong one, with
     ties counting half. None if all matches are correct, or none is."""
     scores, correct = np.asarray(scores), np.asarray(correct, bool)
-    right, wrong = scores[correct], np.sort(scores[~correct])
-    if not len(right) or not len(wrong):
+    correct_scores, wrong_scores = scores[correct], np.sort(scores[~correct])
+    if not len(correct_scores) or not len(wrong_scores):
         return None
-    below = np.searchsorted(wrong, right, "left")
-    below_or_equal = np.searchsorted(wrong, right, "right")
-    return float(np.mean((below + below_or_equal) / 2) / len(wrong))
+    below = np.searchsorted(wrong_scores, correct_scores, "left")
+    below_or_equal = np.searchsorted(wrong_scores, correct_scores, "right")
+    return float(np.mean((below + below_or_equal) / 2) / len(wrong_scores))
 
 
 def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:

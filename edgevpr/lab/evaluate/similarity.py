@@ -52,11 +52,11 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
     rows = []
     for row, answers in zip(scores, truth.values(), strict=True):
         if answers:
-            right, ignored = (np.array([name in group for name in names], bool) for group in answers)
+            correct, ignored = (np.array([name in group for name in names], bool) for group in answers)
             ranked = np.argsort(-row, kind="stable")
             ranked = ranked[~ignored[ranked]]
             score = row[ranked[0]] if len(ranked) else -math.inf
-            rows.append((score, rank_of_first_correct(ranked, right), bool(right.any())))
+            rows.append((score, rank_of_first_correct(ranked, correct), bool(correct.any())))
     if not rows:
         raise UsageError(f"{label}: the ground truth scores none of its queries: pass the matching ground truth.")
     columns = map(np.array, zip(*rows, strict=True))

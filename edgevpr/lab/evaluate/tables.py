@@ -74,11 +74,11 @@ COSTS: tuple[Column, ...] = (
 )
 
 
-def make_rows(result: Quality, columns: Sequence[Column], both: bool = True) -> Iterator[list[str]]:
-    """Yield the row of a result. With `both`, also yield a row for the queries whose place is in the map, if there are
-    others."""
+def make_rows(result: Quality, columns: Sequence[Column], include_in_map: bool = True) -> Iterator[list[str]]:
+    """Yield the row of a result. With `include_in_map`, also yield a row for the queries whose place is in the map, if
+    there are others."""
     yield [result.technique, *(format_cell(result) for _, format_cell in columns)]
-    if both and result.with_match:
+    if include_in_map and result.with_match:
         yield [f"{result.technique}, in map", *(format_cell(result.with_match) for _, format_cell in columns)]
 
 
@@ -93,7 +93,7 @@ def format_results(results: Sequence[Quality]) -> str:
     has_costs = isinstance(results[0], TechniqueResult)
     texts = []
     for columns in (RECALLS, (*CURVE, *DECISIONS), COSTS) if has_costs else (RECALLS, CURVE):
-        rows = [row for result in results for row in make_rows(result, columns, both=columns is not COSTS)]
+        rows = [row for result in results for row in make_rows(result, columns, include_in_map=columns is not COSTS)]
         texts.append("\n".join(align_table([list_headings(columns), *rows])) + "\n")
     return "\n".join([*texts, *list_notes(results)])
 

@@ -47,7 +47,7 @@ def test_load_dataset_reads_a_query_off_the_map(folder, row):
 
 def test_load_dataset_reads_a_spreadsheet_export_without_some_queries(folder):
     dataset = load(folder, b"\xef\xbb\xbfquery_file,ref_files\r\n b.png , b.png \r\n\r\n")
-    assert [(query.path.name, query.right) for query in dataset.queries] == [("b.png", {"b.png"})]
+    assert [(query.path.name, query.correct) for query in dataset.queries] == [("b.png", {"b.png"})]
 
 
 HEADER = "query_file,ref_files,status\n"
@@ -87,7 +87,7 @@ def write_pictures(folder, names):
 
 
 def list_correct(dataset):
-    return {query.path.name: (set(query.right), set(query.ignored)) for query in dataset.queries}
+    return {query.path.name: (set(query.correct), set(query.ignored)) for query in dataset.queries}
 
 
 @pytest.mark.parametrize("inside", ["", "images/test"])
