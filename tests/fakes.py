@@ -183,7 +183,7 @@ class FakeLink:
         wish, self._wish = self._wish, None
         return wish
 
-    def wish(self, wish: UserCommand) -> str:
+    def send_command(self, wish: UserCommand) -> str:
         if not self._is_under_way:
             return "TEMPORARILY_REJECTED"
         self._wish = CommandRequest(wish, "255/190")

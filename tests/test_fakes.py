@@ -146,7 +146,7 @@ def test_link_announces_texts_and_hands_on_wishes(kind):
 
     def wish(wish):
         if kind == "fake":
-            return link.wish(wish)
+            return link.send_command(wish)
         station = {"system_id": 255, "component_id": 190}
         peer.send(mavlink.MAVLink_command_long_message(1, 197, 31010, 0, wish, 0, 0, 0, 0, 0, 0), **station)
         return mavlink.enums["MAV_RESULT"][peer.expect("COMMAND_ACK").result].name.removeprefix("MAV_RESULT_")

@@ -83,7 +83,7 @@ class Autopilot:
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 if self.timesync_s is not None:
                     self.wait(self.timesync_s)
-                    self.say(
+                    self.send(
                         mavlink.MAVLink_timesync_message(round(self.boot_s * 1e9) + 1, message.ts1), address=address
                     )
             else:
@@ -92,13 +92,13 @@ class Autopilot:
                 fix.settle(True)
                 self.conversation.count_sent_fixes([fix])
 
-    def say(self, message, system_id=7, component_id=1, address=None):
+    def send(self, message, system_id=7, component_id=1, address=None):
         packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
         self.conversation.handle(message.pack(packer), self.clock.now_s, address)
 
     def beat(self, base_mode=ARMED, **sender):
         beat = mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3)
-        self.say(beat, **sender)
+        self.send(beat, **sender)
 
     def position(self, lat_deg=50.0, lon_deg=8.0, hdg=9050, vx=0, vy=0, **sender):
         self.locate((lat_deg, lon_deg), 312.5, 80.0, (vx, vy, 0), hdg, **sender)
@@ -106,15 +106,15 @@ class Autopilot:
 
     def locate(self, at_deg, alt_m, relative_m, velocity_cm_s=(0, 0, 0), hdg=9050, **sender):
         where = *(round(degrees * 1e7) for degrees in at_deg), round(alt_m * 1e3), round(relative_m * 1e3)
-        self.say(mavlink.MAVLink_global_position_int_message(self.boot_ms, *where, *velocity_cm_s, hdg), **sender)
+        self.send(mavlink.MAVLink_global_position_int_message(self.boot_ms, *where, *velocity_cm_s, hdg), **sender)
 
     def gps(self, fix_type=FIX_3D, h_acc=0, message=mavlink.MAVLink_gps_raw_int_message, lat_deg=50.0):
         second = () if message is mavlink.MAVLink_gps_raw_int_message else (0, 0)
-        self.say(message(0, fix_type, round(lat_deg * 1e7), 80_000_000, 0, 80, 120, 0, 0, 14, *second, h_acc=h_acc))
+        self.send(message(0, fix_type, round(lat_deg * 1e7), 80_000_000, 0, 80, 120, 0, 0, 14, *second, h_acc=h_acc))
 
     def attitude(self, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
         radians = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
-        self.say(mavlink.MAVLink_attitude_message(self.boot_ms, *radians, 0, 0, 0))
+        self.send(mavlink.MAVLink_attitude_message(self.boot_ms, *radians, 0, 0, 0))
 
     def fly_on(self, seconds, attitude_hz):
         for _ in range(seconds * attitude_hz):
@@ -125,16 +125,16 @@ class Autopilot:
 
     def range(self, distance_m, orientation=25, signal_quality=0):
         fields = 0, 20, 10_000, round(distance_m * 100), 0, 0, orientation, 0
-        self.say(mavlink.MAVLink_distance_sensor_message(*fields, signal_quality=signal_quality))
+        self.send(mavlink.MAVLink_distance_sensor_message(*fields, signal_quality=signal_quality))
 
     def terrain(self, height_m, spacing=100):
-        self.say(mavlink.MAVLink_terrain_report_message(500_000_000, 80_000_000, spacing, 0.0, height_m, 0, 9))
+        self.send(mavlink.MAVLink_terrain_report_message(500_000_000, 80_000_000, spacing, 0.0, height_m, 0, 9))
 
     def filter(self, flags):
-        self.say(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
+        self.send(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
 
     def px4_filter(self, accuracy_m, flags=ABS):
-        self.say(mavlink.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, accuracy_m, 1.0))
+        self.send(mavlink.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, accuracy_m, 1.0))
 
     def put_fix(self, accuracy_m=12.0, **sender):
         """Let a fix be sent where one may be; it leaves at once."""
@@ -144,7 +144,7 @@ class Autopilot:
         return sending
 
     def answer(self, result, command=43003, to=197):
-        self.say(mavlink.MAVLink_command_ack_message(command, result, target_system=7, target_component=to))
+        self.send(mavlink.MAVLink_command_ack_message(command, result, target_system=7, target_component=to))
 
     def take_fix(self, result, accuracy_m=12.0):
         """Let a fix be sent, and answer it."""
@@ -169,7 +169,7 @@ class Autopilot:
             if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
                 nothing = [bytes(8)] * 3
                 version = mavlink.MAVLink_autopilot_version_message(0, 1 << 24 | 17 << 16, 0, 0, 0, *nothing, 0, 0, 0)
-                self.say(version)
+                self.send(version)
             if message.get_type() != "PARAM_REQUEST_READ" or is_lost(message):
                 continue
             if message.param_id in parameters:
@@ -179,7 +179,7 @@ class Autopilot:
             else:
                 continue
             if not is_lost(answer):
-                self.say(answer)
+                self.send(answer)
         return told
 
     def parameter(self, name, value):

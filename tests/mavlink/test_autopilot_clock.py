@@ -52,7 +52,7 @@ def test_gps_input_has_boot_time_and_utc_without_link_jitter():
     for late_s in (0.0, 0.3, 0.1):
         boot_ms, utc_us = autopilot.boot_ms, round((1_700_000_000 + autopilot.boot_s) * 1e6)
         autopilot.wait(late_s)
-        autopilot.say(mavlink.MAVLink_system_time_message(utc_us, boot_ms))
+        autopilot.send(mavlink.MAVLink_system_time_message(utc_us, boot_ms))
         position, now_s = next_sent(autopilot, "GPS_INPUT")
         since_1980_s = position.time_week * 604_800 + position.time_week_ms / 1e3
         expected_s = 1_700_000_000 + (now_s - 600.2) - 315_964_800 + 18
@@ -105,7 +105,7 @@ def test_handle_ignores_an_unrequested_answer():
         assert not clock.handle(mavlink.MAVLink_timesync_message(tc1, ts1), 1000.1)
     assert clock.boot_time_s(1000.0) is None
     autopilot = Autopilot(timesync_s=None)
-    autopilot.say(mavlink.MAVLink_timesync_message(5 * 10**9, round(autopilot.clock.now_s * 1e9)), component_id=190)
+    autopilot.send(mavlink.MAVLink_timesync_message(5 * 10**9, round(autopilot.clock.now_s * 1e9)), component_id=190)
     assert autopilot.conversation.autopilot.clock.boot_time_s(1000.0) is None, "answered by another component"
 
 
@@ -146,16 +146,16 @@ def make_foreign_message(kind, stamp_s):
 @pytest.mark.parametrize("kind", ["LANDING_TARGET", "VISION_POSITION_ESTIMATE", "43003"])
 def test_timestamps_of_others_in_another_time_base_are_reported_once(kind, caplog):
     autopilot = Autopilot(booted_s=600.0)
-    autopilot.say(make_foreign_message(kind, autopilot.boot_s - 0.4), component_id=191)
-    autopilot.say(make_foreign_message(kind, 1.7e9), component_id=1)
+    autopilot.send(make_foreign_message(kind, autopilot.boot_s - 0.4), component_id=191)
+    autopilot.send(make_foreign_message(kind, 1.7e9), component_id=1)
     assert autopilot.texts() == []
     for _ in range(3):
-        autopilot.say(make_foreign_message(kind, 1.7e9), component_id=191)
+        autopilot.send(make_foreign_message(kind, 1.7e9), component_id=191)
     texts = [text for _, text in autopilot.texts()]
     assert texts == [make_status_text(Severity.WARNING, f"edgevpr: bad timestamps: 7/191 {kind}").text]
     assert caplog.text.count("differ from the autopilot's time") == 1
     px4 = Autopilot(PX4)
-    px4.say(make_foreign_message(kind, 1.7e9), component_id=191)
+    px4.send(make_foreign_message(kind, 1.7e9), component_id=191)
     assert px4.texts() == [], "which converts each sender's own clock"
 
 
@@ -165,8 +165,8 @@ def report_late(autopilot, late_s):
         autopilot.beat()
         boot_ms = autopilot.boot_ms
         autopilot.wait(late_s)
-        autopilot.say(mavlink.MAVLink_global_position_int_message(boot_ms, 500_000_000, 80_000_000, 0, 0, 0, 0, 0, 0))
-        autopilot.say(mavlink.MAVLink_attitude_message(boot_ms, 0.5, 0, 0, 0, 0, 0))
+        autopilot.send(mavlink.MAVLink_global_position_int_message(boot_ms, 500_000_000, 80_000_000, 0, 0, 0, 0, 0, 0))
+        autopilot.send(mavlink.MAVLink_attitude_message(boot_ms, 0.5, 0, 0, 0, 0, 0))
         autopilot.wait(0.1)
     return [message.text for message in autopilot.take_sent() if message.get_type() == "STATUSTEXT"]
 
@@ -222,7 +222,7 @@ def test_put_back_sends_ardupilot_the_position_at_its_assumed_delay(age_s, forei
         autopilot.wait(0.5)
         autopilot.position(50.0 + north_deg * autopilot.boot_s, vx=2000)
         if foreign_s:
-            autopilot.say(make_foreign_message("LANDING_TARGET", foreign_s), component_id=191)
+            autopilot.send(make_foreign_message("LANDING_TARGET", foreign_s), component_id=191)
             link.correct(foreign_s, autopilot.boot_s)
         frame_s = autopilot.boot_s - age_s
         fix = Fix(50.0 + north_deg * frame_s, 8.0, 5.0, autopilot.clock.now_s - age_s)

@@ -56,7 +56,7 @@ def test_copter_with_our_receiver_gets_ten_positions_a_second():
     positions = collect(autopilot, "GPS_INPUT", 2.0)
     assert len(positions) == pytest.approx(20, abs=1)
     assert {(each.gps_id, each.lat, each.time_week, each.fix_type) for each in positions} == {(1, 470_000_000, 0, 3)}
-    autopilot.say(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 0))
+    autopilot.send(mavlink.MAVLink_system_time_message(1_700_000_000_000_000, 0))
     ear.state = None
     last = collect(autopilot, "GPS_INPUT")[-1]
     assert (last.fix_type, last.time_week) == (mavlink.GPS_FIX_TYPE_NO_FIX, 2288)
@@ -75,7 +75,7 @@ def test_odometry_waits_for_an_origin_and_sets_one_if_allowed():
         autopilot.beat()
         collect(autopilot, "ODOMETRY", 4.0)
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 2, "the first one may be too early"
-    autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+    autopilot.send(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
     autopilot.beat()
     assert len(collect(autopilot, "ODOMETRY")) == pytest.approx(10, abs=1)
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 2
@@ -89,7 +89,7 @@ def test_origin_without_altitude_uses_the_pressure_altitude():
         requests = [message for message in collect(autopilot, "COMMAND_LONG", 4.0) if message.param1 == asked]
     assert requests
     assert "SET_GPS_GLOBAL_ORIGIN" not in autopilot.conversation.sent
-    autopilot.say(mavlink.MAVLink_scaled_pressure_message(0, 945.0, 0, 2000))
+    autopilot.send(mavlink.MAVLink_scaled_pressure_message(0, 945.0, 0, 2000))
     origins, texts = [], []
     for _ in range(12):
         autopilot.beat()
@@ -102,7 +102,7 @@ def test_origin_without_altitude_uses_the_pressure_altitude():
     # Whatever that altitude is: positions and heights of ours are the same.
     ear.state = replace(STATE, alt_m=700.0)
     for off_m in (0.0, 500.0):
-        autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, round(1e3 * (584 + off_m))))
+        autopilot.send(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, round(1e3 * (584 + off_m))))
         autopilot.locate((46.5, 7.5), 700.0 + off_m, 116.0)
         assert autopilot.vehicle.height_m == 116.0
         ear.state = replace(STATE, alt_m=autopilot.vehicle.alt_m)
@@ -112,10 +112,10 @@ def test_origin_without_altitude_uses_the_pressure_altitude():
 
 def test_conversation_reads_accelerations_together_with_the_attitude():
     autopilot, ear = interview()
-    autopilot.say(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
+    autopilot.send(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 0, 0, -1000, 0, 0, 0, 0, 0, 0))
     assert ear.forces == []
     autopilot.attitude(roll_deg=28.65)
-    autopilot.say(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 100, 0, -1000, 0, 0, 0, 0, 0, 0))
+    autopilot.send(mavlink.MAVLink_scaled_imu_message(autopilot.boot_ms, 100, 0, -1000, 0, 0, 0, 0, 0, 0))
     ((force, roll_deg),) = ear.forces
     assert force == pytest.approx((0.980665, 0.0, -9.80665))
     assert roll_deg == pytest.approx(28.65, abs=0.01)
@@ -140,7 +140,7 @@ def test_px4_with_odometry_is_asked_for_its_origin_and_sent_positions_relative_t
         autopilot.beat()
         asks += [said.param1 for said in collect(autopilot, "COMMAND_LONG") if said.command == 512]
     assert wanted in asks
-    autopilot.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+    autopilot.send(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
     autopilot.beat()
     said = collect(autopilot, "ODOMETRY", 3.0)
     assert len(said) == pytest.approx(30, abs=1)

@@ -44,7 +44,7 @@ class ParamPilot(Autopilot):
         """Set parameters, and broadcast them as autopilots do."""
         self.parameters |= parameters
         for name, value in parameters.items():
-            self.say(self.parameter(name, value))
+            self.send(self.parameter(name, value))
 
     def sentences(self):
         sent, self.sent = self.sent, []

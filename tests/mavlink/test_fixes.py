@@ -153,7 +153,7 @@ def test_fixes_refused_report_the_reason_from_the_autopilot_state(autopilot):
     codes = [refused(after_s=3.0).why.code] + [refused().why.code for _ in range(20)]
     assert set(codes) == {ReasonCode.NO_ORIGIN}, "while it is asked again, too"
     assert len(autopilot.questions()) == 2
-    autopilot.say(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
+    autopilot.send(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
     autopilot.filter(mavlink.EKF_CONST_POS_MODE)
     assert refused().why.code is ReasonCode.NO_ESTIMATE
     assert refused(ACCEPTED).why is None
@@ -183,7 +183,7 @@ def test_fixes_count_only_answers_of_our_autopilot_to_us(autopilot):
     autopilot.answer(ACCEPTED, command=400)
     autopilot.answer(ACCEPTED, to=191)
     ack = mavlink.MAVLink_command_ack_message(43003, ACCEPTED, target_system=7, target_component=197)
-    autopilot.say(ack, system_id=9)
+    autopilot.send(ack, system_id=9)
     assert autopilot.conversation.autopilot.acks == {"99": 1}
 
 

@@ -41,7 +41,7 @@ class Vehicle:
         """As ArduPilot 4.6 does: the height follows home."""
         above_home_m = GROUND_M + self.height_m + self.origin_m - self.home_m
         current_m = above_home_m - (self.terrain_m - GROUND_M)
-        self.autopilot.say(mavlink.MAVLink_terrain_report_message(0, 0, 100, self.terrain_m, current_m, 0, 9))
+        self.autopilot.send(mavlink.MAVLink_terrain_report_message(0, 0, 100, self.terrain_m, current_m, 0, 9))
 
     def take_off(self, height_m=100.0):
         self.fly()

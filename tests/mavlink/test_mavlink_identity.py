@@ -63,10 +63,10 @@ def test_identity_ignores_a_second_sender_with_the_same_system_id(autopilot, cap
     for _ in range(40):
         autopilot.wait(1.0)
         autopilot.beat(address=THERE)
-        autopilot.say(
+        autopilot.send(
             mavlink.MAVLink_command_ack_message(43003, 0, target_system=7, target_component=197), address=THERE
         )
-        autopilot.say(mavlink.MAVLink_command_long_message(7, 197, 31010, 0, 1, 0, 0, 0, 0, 0, 0), 255, 190, THERE)
+        autopilot.send(mavlink.MAVLink_command_long_message(7, 197, 31010, 0, 1, 0, 0, 0, 0, 0, 0), 255, 190, THERE)
         autopilot.beat()
     assert autopilot.put_fix().sent
     assert autopilot.conversation.autopilot.acks == {}

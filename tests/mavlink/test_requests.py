@@ -27,7 +27,7 @@ def reply_to(autopilot, *messages, sender=STATION):
     """What comes for messages of the ground station."""
     autopilot.take_sent()
     for message in messages:
-        autopilot.say(message, *sender)
+        autopilot.send(message, *sender)
     return autopilot.take_sent()
 
 
@@ -86,7 +86,7 @@ def test_requests_in_a_flood_are_answered_in_part_and_do_not_displace_our_messag
     autopilot.take_sent()
     autopilot.conversation.send(make_status_text(INFO, "ours"))
     for message in flood:
-        autopilot.say(message, *STATION)
+        autopilot.send(message, *STATION)
     ours, *answers = autopilot.take_sent()
     assert ours.text == "ours"
     assert [answer.ts1 for answer in answers] == list(range(MAX_ANSWERS_PER_S))

@@ -22,25 +22,25 @@ class Aircraft(Autopilot):
         self.says_boot_time, self.has_origin = says_boot_time, False
         super().__init__(booted_s=booted_s, listener=self.ear, origin=Position(46.5, 7.5, 400.0), **settings)
         self.conversation.request_position()
-        self.forget()
+        self.clear()
 
-    def forget(self):
+    def clear(self):
         self.received, self.rates = [], set()
 
     def power_cycle(self, silent_s):
         self.take_sent()
         self.reboot(silent_s)
         self.has_origin = False
-        self.forget()
+        self.clear()
 
-    def live(self, seconds):
+    def run(self, seconds):
         """Live on, and return the texts that were sent meanwhile."""
         texts = []
         for tick in range(round(seconds * 10)):
             if tick % 10 == 0:
                 self.beat()
                 if self.has_origin:
-                    self.say(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
+                    self.send(mavlink.MAVLink_gps_global_origin_message(465_000_000, 75_000_000, 400_000))
             if self.says_boot_time and mavlink.MAVLINK_MSG_ID_ATTITUDE in self.rates:
                 self.attitude()
                 self.position()
@@ -71,12 +71,12 @@ class Aircraft(Autopilot):
 )
 def test_power_cycle_of_any_length_is_a_new_autopilot(silent_s, says_boot_time, timesync_s, caplog):
     aircraft = Aircraft({"GPS2_TYPE": 0}, says_boot_time=says_boot_time, timesync_s=timesync_s)
-    aircraft.live(20)
+    aircraft.run(20)
     assert "GPS_INPUT" not in aircraft.names()
     sending = aircraft.put_fix()
     aircraft.parameters = RECEIVER
     aircraft.power_cycle(silent_s)
-    texts = aircraft.live(15)
+    texts = aircraft.run(15)
     assert sending.answer is None
     assert "edgevpr: autopilot has restarted" in texts
     assert {IMU, mavlink.MAVLINK_MSG_ID_ATTITUDE} <= aircraft.rates
@@ -90,12 +90,12 @@ def test_power_cycle_of_any_length_is_a_new_autopilot(silent_s, says_boot_time, 
 
 def test_power_cycle_repeats_announcements_and_requests():
     aircraft = Aircraft(VISION)
-    aircraft.live(20)
+    aircraft.run(20)
     assert aircraft.names().count("SET_GPS_GLOBAL_ORIGIN") == 1
     assert aircraft.names().count("ODOMETRY") > 50
     for restarts in (1, 2):
         aircraft.power_cycle(1.6)
-        texts = aircraft.live(20)
+        texts = aircraft.run(20)
         assert aircraft.names().count("SET_GPS_GLOBAL_ORIGIN") == 1
         assert aircraft.names().count("ODOMETRY") > 50
         assert IMU in aircraft.rates
@@ -108,11 +108,11 @@ def test_power_cycle_repeats_announcements_and_requests():
 @pytest.mark.parametrize("outage_s", [2.0, 8.0, 25.0])
 def test_outage_without_a_restart_resets_nothing(outage_s):
     aircraft = Aircraft(VISION)
-    aircraft.live(20)
+    aircraft.run(20)
     before = aircraft.conversation.autopilot.clock
     aircraft.wait(outage_s)
     aircraft.received = []
-    texts = aircraft.live(20)
+    texts = aircraft.run(20)
     assert aircraft.conversation.autopilot.clock is before
     assert (aircraft.ear.autopilots, aircraft.ear.channels) == (1, [Channel.NONE, Channel.ODOMETRY])
     assert "SET_GPS_GLOBAL_ORIGIN" not in aircraft.names()
@@ -122,21 +122,21 @@ def test_outage_without_a_restart_resets_nothing(outage_s):
 
 def test_restart_is_recognised_even_if_the_new_boot_time_is_higher():
     aircraft = Aircraft(VISION, booted_s=997.0)
-    aircraft.live(3)
+    aircraft.run(3)
     aircraft.wait(9.0)
     aircraft.booted_s = aircraft.clock.now_s - 7.5
-    assert "edgevpr: autopilot has restarted" in aircraft.live(20)
+    assert "edgevpr: autopilot has restarted" in aircraft.run(20)
 
 
 def test_delayed_messages_are_not_a_restart():
     """A busy companion reads what has come in ten seconds at once."""
     aircraft = Aircraft(VISION)
-    aircraft.live(20)
+    aircraft.run(20)
     held_up = [round(aircraft.boot_s * 1e3) + number * 100 for number in range(100)]
     aircraft.wait(10.0)
     for boot_ms in held_up:
-        aircraft.say(mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
+        aircraft.send(mavlink.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
         if boot_ms % 1000 < 100:
             aircraft.beat()
-    assert not any("restarted" in text for text in aircraft.live(20))
+    assert not any("restarted" in text for text in aircraft.run(20))
     assert aircraft.ear.autopilots == 1

@@ -122,7 +122,7 @@ class SimFlight:
     def velocity(self, t_s: float) -> np.ndarray:
         return self.speed_m_s * np.array([math.sin(t_s / 20), math.cos(t_s / 20)])
 
-    def off(self, lat_deg: float, lon_deg: float, t_s: float | None = None) -> np.ndarray:
+    def measure_error(self, lat_deg: float, lon_deg: float, t_s: float | None = None) -> np.ndarray:
         """Metres (2,) of a position from where the aircraft was."""
         true_m = self.at_m if t_s is None else self.way[round(t_s / STEP_S)]
         return np.array(offset_m(*HOME, lat_deg, lon_deg)) - true_m
@@ -137,7 +137,7 @@ class SimFlight:
             self.way.append(self.at_m)
             self.off_m = self.gps_off_m if self.has_gps else self.off_m - STEP_S * self.wind
             if not self.is_silent:
-                self._feel((velocity - before) / STEP_S)
+                self._report_force((velocity - before) / STEP_S)
                 if self.step % _REPORT_STEPS == 0:
                     self._report(velocity)
             if self.step % _STATE_STEPS == 0:
@@ -145,23 +145,23 @@ class SimFlight:
             if self.step % self.every_steps == 0:
                 self.waiting.append((self.step, self.vehicle))
             if self.stride_steps and not self.has_gps and self.step % self.stride_steps == 0 and not self.waiting:
-                self._see(self.step, self.vehicle, is_query=False)
+                self._take_frame(self.step, self.vehicle, is_query=False)
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
-                self._look(*self.waiting.popleft())
+                self._take_query(*self.waiting.popleft())
             if self.t_s >= self.between_due_s and (fix := self.navigator.make_interim_fix(self.t_s)):
-                self.between.append((fix, self.off(fix.lat_deg, fix.lon_deg)))
-                self.take(fix)
+                self.between.append((fix, self.measure_error(fix.lat_deg, fix.lon_deg)))
+                self.apply_fix(fix)
             if self.step % 50 == 0:
                 self.errors_m.append(self.off_m)
         return self
 
-    def _look(self, step, vehicle) -> None:
+    def _take_query(self, step, vehicle) -> None:
         if self.matches:
             self.match(step, vehicle)
         else:
-            self._see(step, vehicle)
+            self._take_frame(step, vehicle)
 
-    def _see(self, step, vehicle, is_query=True) -> None:
+    def _take_frame(self, step, vehicle, is_query=True) -> None:
         frame = Frame(image=PICTURE, name="", t_mono_s=step * STEP_S)
         event = Recognition(frame=frame, vehicle=vehicle, odometry=self._stride(step))
         self.navigator.handle_frame(event, is_query)
@@ -176,7 +176,7 @@ class SimFlight:
         from_s, to_s = before * STEP_S, step * STEP_S
         return OdometryStep(from_s=from_s, to_s=to_s, moved_m=tuple(moved_m), sd_m=self.stride_sd_m, inliers=100)
 
-    def tell(self, event: Recognition) -> Advice:
+    def advise(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)
 
     def match(self, step, vehicle) -> Advice:
@@ -190,24 +190,24 @@ class SimFlight:
             located = replace(event.located, heading_deg=-math.degrees(self.turn))
             event = replace(event, picture=picture, located=located)
         self.events.append(event)
-        advice = self.tell(event)
+        advice = self.advise(event)
         self.advices.append((self.t_s, advice))
         if advice.fix:
-            self.take(advice.fix)
+            self.apply_fix(advice.fix)
         return advice
 
-    def take(self, fix: Fix) -> None:
+    def apply_fix(self, fix: Fix) -> None:
         """Take a fix, as the autopilot does that gets it."""
         self.between_due_s = self.t_s + INTERIM_FIX_INTERVAL_S
         if self.takes_fixes:
-            self.off_m = self.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
+            self.off_m = self.measure_error(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
             self.known = fix.accuracy_m, self.t_s
 
     def places(self, step: int) -> tuple[int, ...]:
         """The places that a match of that step is of."""
         return (round(step * STEP_S),)
 
-    def _feel(self, acceleration_m_s2: np.ndarray) -> None:
+    def _report_force(self, acceleration_m_s2: np.ndarray) -> None:
         east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)
         self.navigator.handle_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
 

@@ -43,7 +43,7 @@ class CameraFlight:
         pose = CameraPose(**place, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg)
         return compress(photograph(self._ground, METRES_PER_PIXEL, pose, CAMERA, LIGHT, self.rng), self.rng)
 
-    def see(self, picture, heading_deg=90.0, roll_deg=0.0, pitch_deg=0.0, velocity_m_s=(0.0, 0.0), height_m=HEIGHT_M):
+    def show(self, picture, heading_deg=90.0, roll_deg=0.0, pitch_deg=0.0, velocity_m_s=(0.0, 0.0), height_m=HEIGHT_M):
         """Judge a picture; return why it is refused."""
         self.t_s += self._every_s
         off_deg = self.rng.normal(0, self._sd, 3)
@@ -59,7 +59,7 @@ class CameraFlight:
         pictures = []
         for number in range(count):
             pictures.append(self.photograph(east_m=start_m + number * speed_m_s * self._every_s, **how))
-            self.see(pictures[-1], velocity_m_s=(speed_m_s, 0.0))
+            self.show(pictures[-1], velocity_m_s=(speed_m_s, 0.0))
         return pictures
 
 

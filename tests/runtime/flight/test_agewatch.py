@@ -60,12 +60,12 @@ class LateCameraFlight(SimFlight):
         if age.is_unknown:
             self.refused.append(self.t_s)
             return Advice(None, Reason(ReasonCode.AGE_UNKNOWN))
-        advice = self.tell(event)
+        advice = self.advise(event)
         self.advices.append((self.t_s, advice))
         if advice.fix:
-            error_m = math.hypot(*self.off(advice.fix.lat_deg, advice.fix.lon_deg, advice.fix.t_frame_s))
+            error_m = math.hypot(*self.measure_error(advice.fix.lat_deg, advice.fix.lon_deg, advice.fix.t_frame_s))
             self.errors_sd.append(error_m / advice.fix.accuracy_m)
-            self.take(advice.fix)
+            self.apply_fix(advice.fix)
         return advice
 
     def _report(self, velocity):

@@ -19,7 +19,7 @@ def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_
     def work():
         health.append(link.health.name)
         if wish := wishes.get(len(health)):
-            answers.append(link.wish(wish))
+            answers.append(link.send_command(wish))
 
     lines = make_flight().fly(FakeSource(pictures(7), clock, work=work))
     assert answers == ["ACCEPTED", "ACCEPTED"]
@@ -35,8 +35,8 @@ def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_
 
 def test_pause_halts_a_recording(make_flight, clock, link):
     flown = make_flight()
-    source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(UserCommand.PAUSE))
-    clock.at(30.0, lambda: link.wish(UserCommand.RESUME))
+    source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.send_command(UserCommand.PAUSE))
+    clock.at(30.0, lambda: link.send_command(UserCommand.RESUME))
     clock.at(60.0, flown.stop)
     started_s = clock.now_s
     lines = flown.fly(source)
@@ -50,7 +50,7 @@ def test_pause_feeds_the_watchdog_and_shows_in_the_status(make_flight, clock, li
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     assert systemd.watchdog_interval_s() == 1.0
     monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
-    source = FakeSource(pictures(9), clock, work=lambda: link.wish(UserCommand.PAUSE))
+    source = FakeSource(pictures(9), clock, work=lambda: link.send_command(UserCommand.PAUSE))
     lines = make_flight().fly(source)
     assert queries(lines) == ["frame 000000"]
     assert sum("WATCHDOG" in each for each in told) == 9

@@ -45,7 +45,7 @@ def test_frozen_watch_refuses_static_images_in_flight_until_they_change(ground, 
     flown = CameraFlight(ground)
     last = flown.fly_on(6, speed_m_s)[-1]
     for picture in harm(last, flown.rng, 16):
-        flown.see(picture, velocity_m_s=(speed_m_s, 0.0))
+        flown.show(picture, velocity_m_s=(speed_m_s, 0.0))
     assert flown.refused == [None] * (5 + within_s) + [UNCHANGED] * (17 - within_s)
     flown.autopilot.reset_navigation.assert_called_once()
     flown.fly_on(6, speed_m_s, start_m=180.0)
@@ -68,7 +68,7 @@ def test_frozen_watch_refuses_static_images_in_a_turn(ground, optics, turn):
     flown.fly_on(3, 10.0)
     still = flown.photograph()
     for number in range(16):
-        flown.see(compress(still, flown.rng), **turn(number))
+        flown.show(compress(still, flown.rng), **turn(number))
     assert flown.refused[:5] == [None] * 5
     assert all(flown.refused[11:])
     assert flown.notes == [str(UNCHANGED)]
@@ -80,7 +80,7 @@ def test_frozen_watch_refuses_a_repeated_clip_in_flight(ground, is_in_order):
     clip = flown.fly_on(20, 5.0)
     for number in range(40):
         shown = clip[number % 20 if is_in_order else flown.rng.integers(20)]
-        flown.see(compress(shown, flown.rng), velocity_m_s=(5.0, 0.0))
+        flown.show(compress(shown, flown.rng), velocity_m_s=(5.0, 0.0))
     assert flown.refused[:20] == [None] * 20
     assert all(flown.refused[30:])
     assert flown.notes == [str(Reason(ReasonCode.IMAGES_REPEATED))]
@@ -92,7 +92,7 @@ def test_frozen_watch_accepts_laps_of_whole_seconds(ground):
     east_m, north_m = 160.0, 80.0
     for east, north in 3 * sides:
         picture = flown.photograph(east_m, north_m)
-        assert flown.see(picture, velocity_m_s=(6.0 * east, 6.0 * north)) is None
+        assert flown.show(picture, velocity_m_s=(6.0 * east, 6.0 * north)) is None
         east_m, north_m = east_m + 6.0 * east, north_m + 6.0 * north
 
 
@@ -101,9 +101,9 @@ def test_frozen_watch_refuses_a_clip_whose_turns_are_not_flown(ground):
     turns = [30.0 * number for number in range(12)]
     clip = [flown.photograph(heading_deg=heading_deg) for heading_deg in turns]
     for picture, heading_deg in zip(clip, turns, strict=True):
-        flown.see(picture, heading_deg=heading_deg)
+        flown.show(picture, heading_deg=heading_deg)
     for picture in clip:
-        flown.see(compress(picture, flown.rng), heading_deg=330.0)
+        flown.show(compress(picture, flown.rng), heading_deg=330.0)
     assert flown.refused[:12] == [None] * 12
     assert all(flown.refused[-6:])
 
@@ -116,7 +116,7 @@ def test_frozen_watch_accepts_a_hover_in_gusts(ground, drift_m, tilt_deg, every_
         roll_deg, pitch_deg, turn_deg = flown.rng.normal(0, tilt_deg, 3)
         attitude = {"heading_deg": 90.0 + turn_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
         picture = flown.photograph(200.0 + at_m[0], 120.0 + at_m[1], **attitude)
-        flown.see(picture, velocity_m_s=flown.rng.normal(0, 0.7, 2), **attitude)
+        flown.show(picture, velocity_m_s=flown.rng.normal(0, 0.7, 2), **attitude)
     assert flown.refused == [None] * 60
 
 
@@ -125,7 +125,7 @@ def test_frozen_watch_accepts_a_camera_on_the_ground_while_the_heading_converges
     still = flown.photograph()
     for number in range(60):
         heading_deg = 0.0 if number < 20 else 137.0
-        flown.see(compress(still, flown.rng), heading_deg=heading_deg, height_m=0.2, velocity_m_s=(1.5, 0.0))
+        flown.show(compress(still, flown.rng), heading_deg=heading_deg, height_m=0.2, velocity_m_s=(1.5, 0.0))
     assert flown.refused == [None] * 60
 
 
@@ -138,7 +138,7 @@ def test_frozen_watch_accepts_the_horizon_in_straight_flight(ground):
         shift = np.array([[1, 0, -8.6 * turn_deg], [0, 1, 8.6 * pitch_deg]])
         picture = cv2.warpAffine(far, shift, (640, 480), borderMode=cv2.BORDER_REFLECT)
         attitude = {"heading_deg": 90.0 + turn_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
-        flown.see(compress(picture, flown.rng), velocity_m_s=(20.0, 0.0), **attitude)
+        flown.show(compress(picture, flown.rng), velocity_m_s=(20.0, 0.0), **attitude)
     assert flown.refused == [None] * 60
 
 
@@ -148,7 +148,7 @@ def test_frozen_watch_accepts_water_fog_and_darkness_under_a_display(ground, lev
     for number in range(40):
         shown = np.clip(flown.rng.normal(level, 4, (480, 640, 1)), 0, 255).astype(np.uint8).repeat(3, axis=2)
         picture = compress(draw_clock(shown, number), flown.rng)
-        flown.see(picture, velocity_m_s=(20.0, 0.0), heading_deg=20.0 * number)
+        flown.show(picture, velocity_m_s=(20.0, 0.0), heading_deg=20.0 * number)
     assert flown.refused == [None] * 40
 
 
@@ -160,7 +160,7 @@ def test_frozen_watch_accepts_flight_along_furrows(ground):
     for _ in range(40):
         furrows = 110 + 40 * np.sin(along / 6) + 20 * np.sin(along / 17) + flown.rng.normal(0, 4, (480, 640))
         picture = np.clip(furrows, 0, 255).astype(np.uint8)[..., None].repeat(3, axis=2)
-        flown.see(compress(picture, flown.rng), velocity_m_s=(15.0, 0.0))
+        flown.show(compress(picture, flown.rng), velocity_m_s=(15.0, 0.0))
     assert flown.refused == [None] * 40
 
 
@@ -172,7 +172,7 @@ def test_frozen_watch_accepts_a_route_flown_again(ground):
             roll_deg, pitch_deg, turn_deg = flown.rng.normal(0, 1.5, 3)
             attitude = {"heading_deg": 90.0 + turn_deg, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
             picture = flown.photograph(start_m + 10.0 * number, north_m, **attitude)
-            flown.see(picture, velocity_m_s=(10.0, 0.0), **attitude)
+            flown.show(picture, velocity_m_s=(10.0, 0.0), **attitude)
     assert flown.refused == [None] * 72
 
 
@@ -181,8 +181,8 @@ def test_frozen_watch_survives_implausible_reports(ground, harm):
     flown = CameraFlight(ground)
     for _ in range(5):
         reported = {"heading_deg": harm, "roll_deg": harm, "velocity_m_s": (harm, harm), "height_m": harm}
-        assert flown.see(flown.photograph(), **reported) is None
-    assert flown.see(np.zeros((3, 4), np.uint8)) is None
+        assert flown.show(flown.photograph(), **reported) is None
+    assert flown.show(np.zeros((3, 4), np.uint8)) is None
 
 
 def test_flight_refuses_frozen_images_and_reports_them(make_flight, clock, link):

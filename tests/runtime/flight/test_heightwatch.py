@@ -14,7 +14,7 @@ class Watch:
     def __init__(self, notifier, clock, link) -> None:
         self.clock, self.link, self.watch = clock, link, HeightWatch(notifier)
 
-    def see(self, *heights_m, reported_m=100.0, accepted=True, ratio=1.0, every_s=1.0, age_s=0.0):
+    def update(self, *heights_m, reported_m=100.0, accepted=True, ratio=1.0, every_s=1.0, age_s=0.0):
         """Let matches of these heights be seen; return the texts so far."""
         for height_m in heights_m:
             self.clock.now_s += every_s
@@ -38,13 +38,13 @@ def watch(notifier, clock, link):
 
 
 def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
-    assert watch.see(150, 160, 158, 162) == []
+    assert watch.update(150, 160, 158, 162) == []
     assert watch.watch.ratio == 1.0
-    assert watch.see(155) == ["height: autopilot 100 m, images 158 m"]
+    assert watch.update(155) == ["height: autopilot 100 m, images 158 m"]
     assert watch.watch.ratio == pytest.approx(1.58)
-    watch.see(*[200] * 5, 100, 100, 100, 100)
+    watch.update(*[200] * 5, 100, 100, 100, 100)
     assert len(watch.link.texts()) == 1
-    assert watch.see(100)[1:] == ["height agrees with images again"]
+    assert watch.update(100)[1:] == ["height agrees with images again"]
     assert watch.watch.ratio == 1.0
     assert [(line["kind"], line["note"]) for line in read_log(tmp_path / "log")] == [
         ("height", {"code": "HEIGHT_DIFFERS", "parameters": {"autopilot_height_m": 100.0, "image_height_m": 158.0}}),
@@ -54,25 +54,25 @@ def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
 
 def test_ratio_sd_is_the_deviation_of_the_newest_match(watch):
     assert watch.watch.ratio_sd == 0.0
-    watch.see(101, 99, 108)
+    watch.update(101, 99, 108)
     assert watch.watch.ratio_sd == 0.0, "matches scatter by as much"
-    watch.see(141)
+    watch.update(141)
     assert (watch.watch.ratio, watch.watch.ratio_sd) == (1.0, pytest.approx(0.71))
-    watch.see(*[141] * 4)
+    watch.update(*[141] * 4)
     assert (watch.watch.ratio, watch.watch.ratio_sd) == (pytest.approx(1.41), 0.0)
 
 
 def test_heightwatch_bears_a_reported_height_of_zero(watch):
-    assert watch.see(*[100] * 5, reported_m=0.0) == ["height: autopilot 1 m, images 100 m"]
+    assert watch.update(*[100] * 5, reported_m=0.0) == ["height: autopilot 1 m, images 100 m"]
     assert watch.watch.ratio == 100.0
 
 
 def test_heightwatch_corrects_by_less_than_it_reports(watch):
-    assert watch.see(*[115, 120, 118, 120]) == []
+    assert watch.update(*[115, 120, 118, 120]) == []
     assert watch.watch.ratio == 1.0
-    assert watch.see(122) == []
+    assert watch.update(122) == []
     assert watch.watch.ratio == pytest.approx(1.2)
-    watch.see(105)
+    watch.update(105)
     assert watch.watch.ratio == 1.0
 
 
@@ -91,5 +91,5 @@ def test_heightwatch_corrects_by_less_than_it_reports(watch):
     ],
 )
 def test_height_watch_reports_only_after_five_contradicting_matches(watch, heights_m, how):
-    assert watch.see(*heights_m, **how) == []
+    assert watch.update(*heights_m, **how) == []
     assert watch.watch.ratio == 1.0

@@ -34,7 +34,7 @@ class GpsFlight(SimFlight):
         self.log, self.drift_m_s, self.reports = flight_log.path, 0.0, []
         self.watch = GpsWatch(MAP_SD_M, Notifier(flight_log, self.link), self.autopilot)
 
-    def tell(self, event):
+    def advise(self, event):
         self.clock.now_s = self.t_s
         event = self.autopilot.report_match(event, 0.0)
         self.watch.update(event)
@@ -137,7 +137,7 @@ def test_navigation_trusts_fixes_over_wrong_gps_but_sends_none_while_the_autopil
     for _ in range(20):
         air.fly(1)
         here = air.navigator._navigation.estimate_state(air.t_s).position
-        off_m.append(air.off(here.lat_deg, here.lon_deg))
+        off_m.append(air.measure_error(here.lat_deg, here.lon_deg))
     assert norms(off_m).max() < 8, "where the autopilot is 60 m off and more"
     assert air.link.stats().fixes_sent == 0
     assert {report.why.code for report in air.reports[-20:]} == {ReasonCode.HAS_WRONG_GPS}

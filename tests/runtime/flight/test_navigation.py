@@ -32,7 +32,7 @@ class NavigatedFlight(SimFlight):
         self.navigation = Navigation(drift, 1.0)
         navigator = SimpleNamespace(
             handle_vehicle=self.navigation.add_report,
-            handle_force=self.feel if drift is INERTIAL else lambda *_: None,
+            handle_force=self.handle_force if drift is INERTIAL else lambda *_: None,
             estimate_state=self.navigation.estimate_state,
             make_interim_fix=lambda t_s: None,
         )
@@ -40,7 +40,7 @@ class NavigatedFlight(SimFlight):
         self.look = lambda t_s, seen_m: (seen_m, {})
         self.fly(gps_s).lose_gps()
 
-    def feel(self, t_s, force_m_s2, attitude):
+    def handle_force(self, t_s, force_m_s2, attitude):
         self.navigation.add_acceleration(t_s, np.array(force_m_s2[1::-1]))
 
     def match(self, step, vehicle):
@@ -54,7 +54,7 @@ class NavigatedFlight(SimFlight):
     def errors(self, from_s):
         """Errors of the navigation (N, 2), and what it said they were (N,)."""
         states = [(t_s, state) for t_s, state in self.states if t_s > from_s]
-        errors_m = [self.off(state.position.lat_deg, state.position.lon_deg, t_s) for t_s, state in states]
+        errors_m = [self.measure_error(state.position.lat_deg, state.position.lon_deg, t_s) for t_s, state in states]
         return np.array(errors_m), np.array([state.accuracy_m for _, state in states])
 
 

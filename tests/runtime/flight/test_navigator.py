@@ -88,7 +88,7 @@ def test_navigator_claims_match_its_errors(how):
         for _ in range(200):
             air.fly(1)
             here = air.navigator._navigation.estimate_state(air.t_s)
-            known.append((*air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m))
+            known.append((*air.measure_error(here.position.lat_deg, here.position.lon_deg), here.accuracy_m))
     known = np.array(known)
     assert (abs(known[:, :2]) < known[:, 2:]).mean() == pytest.approx(0.68, abs=0.1)
 
@@ -103,7 +103,7 @@ def test_navigator_sends_positions_to_px4_only_without_gps(channel):
     air.fly(150)
     said = sent_states(air, from_s=32.0)
     assert len(said) > 0.99 * 10 * 148
-    off_m = np.array([air.off(state.lat_deg, state.lon_deg, t_s) for t_s, state in said])
+    off_m = np.array([air.measure_error(state.lat_deg, state.lon_deg, t_s) for t_s, state in said])
     claimed_m = np.array([state.accuracy_m for _, state in said])
     assert norms(off_m).max() < 10.0, "of matches that are 3 m off"
     assert (abs(off_m) < claimed_m[:, None]).mean() > 0.58
@@ -164,7 +164,7 @@ def test_navigator_streams_ten_smooth_positions_a_second():
     accuracies_m = [state.accuracy_m / INFLATION for _, state in states]
     assert max(accuracies_m) > 10, "while it lies behind it says so"
     last = states[-1][1]
-    assert air.off(last.lat_deg, last.lon_deg) == pytest.approx((25.0, 0.0), abs=6.0), "it has followed"
+    assert air.measure_error(last.lat_deg, last.lon_deg) == pytest.approx((25.0, 0.0), abs=6.0), "it has followed"
     assert last.accuracy_m / INFLATION < 4
 
 
@@ -172,7 +172,7 @@ def test_navigator_stream_stays_accurate_and_reports_its_accuracy():
     air = lose_gps(use_gps_input(Navigator(1.0, 1.0)), bias=(0.05, -0.03), fix_sd_m=2.0).fly(200)
     states = sent_states(air, 40)
     assert len(states) == pytest.approx(1900, abs=3)
-    off_m = np.array([air.off(state.lat_deg, state.lon_deg, t_s) for t_s, state in states])
+    off_m = np.array([air.measure_error(state.lat_deg, state.lon_deg, t_s) for t_s, state in states])
     said_m = np.array([state.accuracy_m for _, state in states]) / INFLATION
     assert np.median(norms(off_m)) < 2.5
     assert norms(off_m).max() < 8

@@ -21,7 +21,7 @@ class SightFlight:
     def __init__(self, notifier, clock, link):
         self.clock, self.link, self.sight = clock, link, MapCoverageWatch(notifier)
 
-    def look(self, outcomes: str, every_s: float = 1.0):
+    def query(self, outcomes: str, every_s: float = 1.0):
         """`+` accepted, `-` not, `L` not and lost, `0` shows nothing, `x` failed, `t` tilted, `n` not worth a search,
         `u` no query."""
         for outcome in outcomes:
@@ -47,11 +47,11 @@ def sight_flight(notifier, clock, link):
 
 
 def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_matches(sight_flight, tmp_path):
-    assert sight_flight.look("+++" + "-" * 29) == []
-    assert sight_flight.look("-") == ["aircraft has left the map"]
-    assert sight_flight.look("-" * 50) == ["aircraft has left the map"]
-    assert sight_flight.look("+--") == ["aircraft has left the map"]
-    assert sight_flight.look("+") == ["aircraft has left the map", "aircraft is back on the map"]
+    assert sight_flight.query("+++" + "-" * 29) == []
+    assert sight_flight.query("-") == ["aircraft has left the map"]
+    assert sight_flight.query("-" * 50) == ["aircraft has left the map"]
+    assert sight_flight.query("+--") == ["aircraft has left the map"]
+    assert sight_flight.query("+") == ["aircraft has left the map", "aircraft is back on the map"]
     assert [(line["kind"], line["note"]["code"]) for line in read_log(tmp_path / "log")] == [
         ("sight", "MAP_LEFT"),
         ("sight", "MAP_FOUND"),
@@ -69,20 +69,20 @@ def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_mat
     ],
 )
 def test_sight_requires_several_queries_to_leave_or_find_the_map(sight_flight, outcomes, texts):
-    assert sight_flight.look(outcomes) == texts
+    assert sight_flight.query(outcomes) == texts
 
 
 @pytest.mark.parametrize("outcome", "0xtnu")
 def test_sight_ignores_queries_without_information_about_the_map(sight_flight, outcome):
-    assert "aircraft has left the map" not in sight_flight.look("+++" + "-" * 29 + outcome * 40)
-    assert sight_flight.look("-")[-1] == "aircraft has left the map"
+    assert "aircraft has left the map" not in sight_flight.query("+++" + "-" * 29 + outcome * 40)
+    assert sight_flight.query("-")[-1] == "aircraft has left the map"
 
 
 def test_sight_reports_tilt_after_five_seconds_and_its_end(sight_flight, tmp_path):
-    assert sight_flight.look("-" + "t" * 5) == []
-    assert sight_flight.look("t") == ["tilt too large"]
-    assert sight_flight.look("-----") == ["tilt too large"]
-    assert sight_flight.look("-") == ["tilt too large", "tilt is acceptable again"]
+    assert sight_flight.query("-" + "t" * 5) == []
+    assert sight_flight.query("t") == ["tilt too large"]
+    assert sight_flight.query("-----") == ["tilt too large"]
+    assert sight_flight.query("-") == ["tilt too large", "tilt is acceptable again"]
     assert [line["kind"] for line in read_log(tmp_path / "log")] == ["tilt", "tilt"]
 
 

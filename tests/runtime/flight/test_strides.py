@@ -27,7 +27,7 @@ def fly_no_gps(air, seconds):
 def measure_error_m(air):
     """Metres (2,) by which our position is wrong now, and what it says of itself."""
     here = air.navigator._navigation.estimate_state(air.t_s)
-    return air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m
+    return air.measure_error(here.position.lat_deg, here.position.lon_deg), here.accuracy_m
 
 
 def measure_offsets_m(air, seconds):

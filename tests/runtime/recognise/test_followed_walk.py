@@ -49,7 +49,7 @@ class TrackedWalk:
         settings = MatchSettings(candidates=42)
         self.recogniser = walk_over(place_map, TECHNIQUE, rule, settings=settings, place_filter=place_filter)
 
-    def see(self, place, confidence=None, elapsed_s=float(STRIDE), image=None):
+    def query(self, place, confidence=None, elapsed_s=float(STRIDE), image=None):
         self._t_s += elapsed_s
         self.confidence = confidence or self.confidence
         seen = frame(place, self._t_s)
@@ -72,7 +72,7 @@ def untracked_walk(whole_map, tmp_path):
 
 def test_tracked_match_is_accepted_although_refused_alone(flight, untracked_walk):
     way = range(1, 19, STRIDE)
-    alone_events, events = ([walk.see(place) for place in way] for walk in (untracked_walk, flight))
+    alone_events, events = ([walk.query(place) for place in way] for walk in (untracked_walk, flight))
     assert not any(event.accepted for event in alone_events)
     assert all(event.track is None for event in alone_events)
     assert [event.accepted for event in events[:1] + events[3:]] == [False] + [True] * 3
@@ -84,21 +84,21 @@ def test_tracked_match_is_accepted_although_refused_alone(flight, untracked_walk
 
 def test_tracked_match_that_contradicts_the_track_is_refused_with_a_reason(flight, untracked_walk):
     for place in range(1, 16, STRIDE):
-        flight.see(place)
-    assert untracked_walk.see(32, 0.9).accepted
-    event = flight.see(32, 0.9, elapsed_s=1.0)
+        flight.query(place)
+    assert untracked_walk.query(32, 0.9).accepted
+    event = flight.query(32, 0.9, elapsed_s=1.0)
     assert (event.accepted, event.position) == (False, None)
     assert event.reason.code is ReasonCode.TRACK_CONTRADICTS
     assert event.best.place.source_image == "32.png"
-    assert flight.see(35, 0.9).accepted or flight.see(38, 0.9).accepted, "but not for long"
+    assert flight.query(35, 0.9).accepted or flight.query(38, 0.9).accepted, "but not for long"
 
 
 def test_tracked_flight_resolves_two_places_that_look_the_same(flight, untracked_walk):
     for place in range(24, 36, STRIDE):
-        flight.see(place, 0.9)
+        flight.query(place, 0.9)
     # By itself the place that comes first in the map is as good as the other.
-    assert untracked_walk.see(DUPLICATE_PLACES[1], 0.9).best.place.source_image == f"{DUPLICATE_PLACES[0]}.png"
-    event = flight.see(DUPLICATE_PLACES[1], 0.9)
+    assert untracked_walk.query(DUPLICATE_PLACES[1], 0.9).best.place.source_image == f"{DUPLICATE_PLACES[0]}.png"
+    event = flight.query(DUPLICATE_PLACES[1], 0.9)
     assert event.best.place.source_image == f"{DUPLICATE_PLACES[1]}.png"
     assert event.ranking.slots[0] == event.track.slot == DUPLICATE_PLACES[1]
     assert event.ranking.scores[0] == pytest.approx(event.best.match.score)
@@ -113,26 +113,26 @@ def test_tracked_hover_keeps_recognising_its_place(whole_map):
     with PlaceMap.open(whole_map) as place_map:
         rule = make_accept_rule(TECHNIQUE, load_config(None).match)
         hovering = TrackedWalk(place_map, rule)
-        assert all(hovering.see(5, elapsed_s=1.0).accepted for _ in range(40))
+        assert all(hovering.query(5, elapsed_s=1.0).accepted for _ in range(40))
         creeping = TrackedWalk(place_map, rule)
-        assert all(creeping.see(5 + look // 4, elapsed_s=0.5).accepted for look in range(40))
+        assert all(creeping.query(5 + look // 4, elapsed_s=0.5).accepted for look in range(40))
 
 
 def test_tracked_flight_survives_blank_and_unusable_images(flight):
     for place in range(1, 16, STRIDE):
-        flight.see(place)
+        flight.query(place)
     flat = np.full((120, 160), 90, np.uint8)
-    event = flight.see(17, elapsed_s=1.0, image=flat)
+    event = flight.query(17, elapsed_s=1.0, image=flat)
     assert (event.lacks_texture, event.accepted, event.track) == (True, False, None)
     assert flight.recogniser.step(Frame(image=None, name="none", t_mono_s=0.0)).failed
-    assert any(flight.see(place).accepted for place in (19, 22))
+    assert any(flight.query(place).accepted for place in (19, 22))
 
 
 def test_tracked_flight_accepts_no_unmapped_ground(whole_map):
     rule = make_rule(lambda evidence: 0.89 if evidence["agree"] > math.log(0.6) else 0.05)
     with PlaceMap.open(whole_map) as place_map:
         walk = TrackedWalk(place_map, rule)
-        assert [walk.see(place).accepted for place in range(1, 16, STRIDE)][-1]
-        away = [walk.see(0, image=textured(900 + look)) for look in range(10)]
+        assert [walk.query(place).accepted for place in range(1, 16, STRIDE)][-1]
+        away = [walk.query(0, image=textured(900 + look)) for look in range(10)]
     assert not any(event.accepted for event in away)
     assert all(event.track.lost > 0.5 for event in away[5:])

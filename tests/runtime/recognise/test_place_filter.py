@@ -55,7 +55,7 @@ class Flight:
         self.place_map, self.index, self.t_s = place_map, index, 1000.0
         self.has_poses = read_layers(place_map).median_m is not None
 
-    def go_on(self, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None):
+    def advance(self, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None):
         """Go on, `moved_m` (east, north) by the camera's own motion."""
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
@@ -81,15 +81,15 @@ class Flight:
             Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where
         )
 
-    def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
-        self.go_on(elapsed_s, velocity_m_s, moved_m)
+    def query(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
+        self.advance(elapsed_s, velocity_m_s, moved_m)
         followed = self.handle(place, p, **more)
         self.follower.commit()
         assert_sound(followed)
         return followed
 
     def over(self, places, p=0.8, **more):
-        return [self.look(place, p, **more) for place in places]
+        return [self.query(place, p, **more) for place in places]
 
 
 def _choose_similar(best, places):
@@ -140,7 +140,7 @@ def make_bare_map(path, has_poses):
 
 @pytest.mark.parametrize("p", [0.01, 0.5, 0.9, 0.9999])
 def test_place_filter_uses_the_first_query_unchanged(flight, p):
-    followed = flight.look(20, p)
+    followed = flight.query(20, p)
     assert followed.slot == 20
     assert followed.confidence == pytest.approx(p)
     assert followed.lost == pytest.approx(1 - p)
@@ -148,7 +148,7 @@ def test_place_filter_uses_the_first_query_unchanged(flight, p):
 
 
 def test_place_filter_shares_the_remaining_probability_among_other_places(flight):
-    followed = flight.look(20, 0.1, of_map=0.9, others=(40,))
+    followed = flight.query(20, 0.1, of_map=0.9, others=(40,))
     assert followed.slot == 40
     assert 0.1 < followed.confidence < 0.8, "it may be none of those that were compared"
     assert followed.confidence + followed.lost == pytest.approx(0.9)
@@ -159,13 +159,13 @@ def test_place_filter_shares_the_remaining_probability_among_other_places(flight
 def test_positions_are_those_of_the_places(posed_map, bare_map):
     posed, bare = Flight(posed_map, METRIC_INDEX), Flight(bare_map, METRIC_INDEX)
     for place in np.arange(10, 60, 2.5):
-        found = posed.look(place)
+        found = posed.query(place)
         assert off_m(found, place) < SPACING_M / 2
     assert found.estimate.sd_m < SPACING_M
     assert found.estimate.heading_deg == pytest.approx(350.0)
     assert found.mass > CERTAIN
     for place in range(10, 60, STRIDE):
-        found = bare.look(place)
+        found = bare.query(place)
         assert off_m(found, place) < SPACING_M
     assert found.estimate.heading_deg is None
     assert found.estimate.sd_m > SPACING_M / 4, "a place says no better where the aircraft is than it is apart"
@@ -199,11 +199,11 @@ def test_place_filter_keeps_only_the_last_pass_of_a_frame(flight):
     other = Flight(flight.place_map, flight.index)
     for each in (flight, other):
         each.over(range(10, 40, STRIDE))
-        each.go_on()
+        each.advance()
     flight.handle(90, 0.9)
     assert flight.handle(40, 0.9) == other.handle(40, 0.9)
     flight.follower.commit(), other.follower.commit()
-    assert flight.look(43) == other.look(43)
+    assert flight.query(43) == other.query(43)
 
 
 def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_map, bare_map):
@@ -211,7 +211,7 @@ def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_ma
     for place_map in (posed_map, bare_map):
         flight = Flight(place_map, some)
         flight.has_poses = False
-        followed = flight.look(30, 0.95, others=(41, 50))
+        followed = flight.query(30, 0.95, others=(41, 50))
         assert followed.confidence < 0.1
         assert not followed.prefers_other(30)
         assert followed.lost > 0.9
@@ -226,10 +226,10 @@ def fly_across_gap(place_map, moved_m, away=60, p=0.5):
     """Six places found, three queries that find nothing while the flight goes on, then one that is right."""
     flight = Flight(place_map, METRIC_INDEX)
     for place in range(6):
-        flight.look(place, moved_m=measure_displacement_m(1))
+        flight.query(place, moved_m=measure_displacement_m(1))
     for place in range(6, 9):
-        flight.look(place + away, p=0.01, moved_m=moved_m)
-    return flight, flight.look(9, p=p, moved_m=moved_m)
+        flight.query(place + away, p=0.01, moved_m=moved_m)
+    return flight, flight.query(9, p=p, moved_m=moved_m)
 
 
 def test_place_filter_confirms_a_doubtful_match_by_odometry(posed_map):
@@ -243,8 +243,8 @@ def test_place_filter_confirms_a_doubtful_match_by_odometry(posed_map):
 def test_place_filter_counts_failed_queries_over_the_same_ground_once(posed_map):
     flight = Flight(posed_map, METRIC_INDEX)
     for place in range(6):
-        flight.look(place, moved_m=measure_displacement_m(1))
-    lost = [flight.look(60, p=0.01, elapsed_s=1.0, moved_m=measure_displacement_m(0.02)).lost for _ in range(20)]
+        flight.query(place, moved_m=measure_displacement_m(1))
+    lost = [flight.query(60, p=0.01, elapsed_s=1.0, moved_m=measure_displacement_m(0.02)).lost for _ in range(20)]
     assert lost[-1] < 0.5
 
 
@@ -252,7 +252,7 @@ def test_place_filter_counts_failed_queries_over_the_same_ground_once(posed_map)
 def test_place_filter_recovers_from_a_wrong_belief(posed_map, moved_m):
     """Carried off by half the map, while the camera sees nothing of it, or sees a motion that is not the aircraft's."""
     flight, _ = fly_across_gap(posed_map, moved_m)
-    found = [flight.look(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]
+    found = [flight.query(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]
     assert found[-1].confidence >= 0.9
     assert found[-1].mass > CERTAIN
     assert off_m(found[-1], 65) < SPACING_M
@@ -261,5 +261,5 @@ def test_place_filter_recovers_from_a_wrong_belief(posed_map, moved_m):
 def test_place_filter_never_confirms_one_of_several_twins(posed_map):
     flight = Flight(posed_map, METRIC_INDEX)
     for place in range(20, 60, STRIDE):
-        followed = flight.look(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)
+        followed = flight.query(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)
         assert followed.confidence < 0.9
