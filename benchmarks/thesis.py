@@ -15,7 +15,7 @@ from base import DATA, REPOSITORY, RESULTS
 from thesis_values import MATRICES, Results, measured_rows, read_results
 
 from edgevpr.lab.evaluate.dataset import read_truth
-from edgevpr.lab.evaluate.similarity import measure, read_similarities
+from edgevpr.lab.evaluate.similarity import assess_quality, read_similarities
 
 SET = "corridor"
 
@@ -40,7 +40,7 @@ def matrices(folder: Path, images: Path) -> dict[str, dict]:
     for path in sorted(folder.glob(f"{SET}_*.npy")):
         name = path.stem.removeprefix(f"{SET}_")
         published = {key: float(times[name][key]) for key in ("t_encode_s", "t_match_per_ref_s")}
-        found[name] = {**asdict(measure(name, read_similarities(path), truth)), **published}
+        found[name] = {**asdict(assess_quality(name, read_similarities(path), truth)), **published}
     return found
 
 

@@ -27,7 +27,7 @@ from edgevpr.runtime.flight.notifier import Notifier
 
 _STATES = {
     Condition.LOST: "lost, reopening in 0.5 s",
-    Condition.FROZEN: "frozen: the same picture again and again",
+    Condition.FROZEN: "frozen: the same picture keeps arriving",
     Condition.OPENING: "opening, no picture yet",
     Condition.ENDED: "ended",
 }

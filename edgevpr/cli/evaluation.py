@@ -86,7 +86,7 @@ def run_eval(args: Namespace) -> int:
 def _measure_similarities(args: Namespace) -> int:
     from edgevpr.lab.evaluate.dataset import list_names, read_truth
     from edgevpr.lab.evaluate.provenance import describe_origin
-    from edgevpr.lab.evaluate.similarity import add_unscored, measure, read_similarities
+    from edgevpr.lab.evaluate.similarity import add_unscored, assess_quality, read_similarities
     from edgevpr.lab.evaluate.tables import format_results
 
     if not args.ground_truth:
@@ -95,7 +95,7 @@ def _measure_similarities(args: Namespace) -> int:
     if args.query:
         truth = add_unscored(truth, list_names(args.query))
     references = list_names(args.ref) if args.ref else None
-    results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
+    results = [assess_quality(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
     qualities = {result.technique: asdict(result) for result in results}
     print_result({**describe_origin(), "similarities": qualities}, args.json, format_results(results))
     return 0

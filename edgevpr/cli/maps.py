@@ -57,7 +57,7 @@ def add(commands: Any) -> None:
     add_json(move)
     calibrate = add_to_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
-    calibrate.add_argument("--config", metavar="FILE", help="flight configuration (only camera, mask and precision)")
+    calibrate.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and precision are used)")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
     info = add_to_map("info", run_map_info, "print what a map contains, or write it as an HTML page")
@@ -84,7 +84,7 @@ def _add_build(build: ArgumentParser) -> None:
     build.add_argument("--technique", metavar="NAME", help="technique (default: chosen for the board)")
     add_parameters(build, "set a parameter of the technique")
     build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
-    build.add_argument("--config", metavar="FILE", help="flight configuration (only camera, mask and salience)")
+    build.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and salience are used)")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
     build.add_argument("--rate-hz", type=parse_positive, metavar="HZ", help="places per second of a video")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="keep the recorded positions")
@@ -103,7 +103,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
         "--footprint-m",
         type=_parse_lengths,
         metavar="M",
-        help="ground along the longest side of an image, in metres; a list for several heights: 75,105,150",
+        help="ground covered by the longest side of an image, in metres; a list for several heights: 75,105,150",
     )
     flags.add_argument(
         "--spacing-m",
@@ -208,12 +208,12 @@ def run_map_calibrate(args: Namespace) -> int:
         encoder = make_encoder(config.source, pictures, create_technique(place_map))
         calibration = calibrate_map(place_map, encoder, config.match, pictures, progress)
     fields = {"map": args.map, "calibration": calibration.figures()}
-    print_result(fields, args.json, [f"{args.map}: calibrated: {calibration.described()}"])
+    print_result(fields, args.json, [f"{args.map}: calibrated: {calibration.describe()}"])
     return 0
 
 
 def run_map_info(args: Namespace) -> int:
-    """Run `map info`: print what a map contains and its size on disk and in RAM; with --page, write its page."""
+    """Run `map info`: print what a map contains and its size on disk and in RAM; with --page, make an HTML page too."""
     from edgevpr.places.index import compute_place_bytes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
@@ -226,7 +226,7 @@ def run_map_info(args: Namespace) -> int:
         info, calibration = describe_map(place_map), read_calibration_for(place_map)
     place_bytes = compute_place_bytes(info.spec)
     if calibration:
-        confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
+        confidence: str | None = f"calibrated {calibration.made}: {calibration.describe()}"
     else:
         confidence = explain_not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
     ram_mb = info.places * place_bytes / 1e6

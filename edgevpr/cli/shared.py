@@ -134,11 +134,11 @@ def parse_value(args: Namespace, name: str) -> Any:
     return getattr(args, _PREFIX + name)
 
 
-def make_config(args: Namespace, path: str | None = None, **others: Any) -> Config:
-    """Make the configuration from the file `path` (None: the defaults). Flags override the file, and `others` (values
-    by configuration key) override both."""
+def make_config(args: Namespace, path: str | None = None, **overrides: Any) -> Config:
+    """Make the configuration from the file `path` (None: the defaults). Flags override the file, and `overrides`
+    (values by configuration key) override both."""
     flags = {name.removeprefix(_PREFIX): value for name, value in vars(args).items() if name.startswith(_PREFIX)}
-    return load_config(path, flags | others)
+    return load_config(path, flags | overrides)
 
 
 def parse_parameters(pairs: list[str]) -> dict[str, str]:

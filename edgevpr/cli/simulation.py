@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
     flight = add_command(simulations, "flight", run_simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
     flight.add_argument("--which", choices=("map", "query"), help="map (default): mapping flight; query: later flight")
-    text = "random seed of landscape and motion (default: 1)"
+    text = "random seed for the landscape and motion (default: 1)"
     flight.add_argument("--seed", type=_parse_seed, default=1, metavar="N", help=text)
     orthophoto = flight.add_argument_group("over an orthophoto")
     orthophoto.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")

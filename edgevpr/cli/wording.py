@@ -51,7 +51,7 @@ def format_build(path: str, built_map: "BuiltMap", from_orthophoto: bool) -> Ite
     if built_map.refined:
         yield from format_refinement(path, built_map.refined)
     if built_map.calibration:
-        yield f"expect: {built_map.calibration.described()}"
+        yield f"expect: {built_map.calibration.describe()}"
         if from_orthophoto:
             yield f"  {_OTHER_SEASON_NOTE}"
     yield from (f"  {sentence}" for sentence in built_map.not_done)

@@ -76,7 +76,7 @@ def sync_folder(path: str | Path) -> None:
 
 def try_lock(file: BinaryIO) -> bool:
     """Lock an open file until it is closed. Return False if another process holds the lock. Return True otherwise,
-    also for a device and on a file system without locks."""
+    including for a device or on a file system without locks."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         try:
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -130,7 +130,7 @@ class MatchConfig:
     reach_m_s: float | None = key(
         None,
         "--reach-m-s V",
-        "maximum speed in m/s: search only the area within reach (default: the whole map)",
+        "maximum speed in m/s: search only the area that the aircraft can have reached (default: the whole map)",
         limits=(0.1, 100),
     )
 

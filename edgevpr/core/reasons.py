@@ -79,8 +79,8 @@ class ReasonCode(Code):
     LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
     FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {min_landmarks:.0f} needed at this score"
     TILT_SHOWN = (
-        "the image looks tilted, but its tilt is unknown",
-        "{summary}: about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
+        "no tilt was reported, but the image looks tilted",
+        "{summary} by about {tilt_deg:.0f} degrees: set `source.mount_ahead_deg`, or record roll and pitch",
     )
     POSITIONS_DISAGREE = "places that show the same ground disagree on the position", "{summary} by {distance_m:.0f} m"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {min_queries:.0f}"
@@ -106,7 +106,7 @@ class ReasonCode(Code):
         "not needed: the autopilot's position is as good",
         "not needed: the autopilot is {distance_m:.1f} m from our position, which is accurate to {accuracy_m:.1f} m",
     )
-    HELD_ROTATED = "held back: contradicts compass", "held back: rotated {rotation_deg:.0f} degrees from the compass"
+    HELD_ROTATED = "held back: contradicts compass", "held back: {rotation_deg:.0f} degrees off the compass heading"
     HELD_OFF_GPS = (
         "held back: far from GPS",
         "held back: {distance_m:.0f} m from the position by GPS and earlier fixes",
@@ -140,7 +140,7 @@ class ReasonCode(Code):
     NOT_STARTED = "filter not started", "its position filter has not started: on a plane it starts only with GPS"
     NO_ORIGIN = "no origin", "it has no origin, so it accepts no position: it needs GPS once, or an origin sent to it"
     NOT_ARMED = "not armed", "it is not armed: on the ground it has no dead-reckoned position to correct"
-    NO_ESTIMATE = "no source of position", "it estimates no position: it has no GPS, airspeed, optical flow or vision"
+    NO_ESTIMATE = "no position source", "it has no position estimate: it has no GPS, airspeed, optical flow or vision"
     OTHER_AID = "not dead reckoning", "it accepts a fix only while it dead-reckons without any other aiding"
     NOT_PLAUSIBLE = "fix not plausible", "it is dead-reckoning, but the fix is not plausible or it has no origin"
     NO_CAUSE = "see its log", "it gives no reason: perhaps it just regained GPS, or has no origin or position source"
@@ -199,7 +199,7 @@ class ReasonCode(Code):
     # Channel to the autopilot: "its" parameters are the autopilot's
     BY_GPS_INPUT = "GPS_INPUT", "GPS_INPUT, because its {parameter} is 14"
     BY_ODOMETRY = "ODOMETRY", "ODOMETRY, because its {parameter} is 1", "; source set {source_set:.0f} without GPS"
-    BY_MESSAGE_296 = "message 296", "message 296, because its {parameter} lets it fuse positions"
+    BY_MESSAGE_296 = "message 296", "GLOBAL_POSITION_SENSOR (296), because its {parameter} enables position fusion"
     COMMAND_TO_PLANE = "command 43003, which a dead-reckoning plane accepts at any time"
     COMMAND_NEEDS_FLOW = (
         "command 43003",
@@ -208,7 +208,7 @@ class ReasonCode(Code):
     COMMAND_WITHOUT_296 = "command 43003", "command 43003, because it has no {parameter} for message 296 (PX4 1.18 has)"
     COMMAND_FOR_296 = (
         "command 43003",
-        "command 43003, because its {parameter} does not let it fuse message 296: change it, and reboot the autopilot",
+        "command 43003, because its {parameter} does not enable message 296: change it, and reboot the autopilot",
     )
     COMMAND_TO_ANY = "command 43003, the only channel used with unknown firmware"
     PARAMETER_WEAK = "a parameter should be changed", "set {changes}. {why}"
@@ -219,7 +219,7 @@ class ReasonCode(Code):
     CPU_OVER_LIMIT = "too much CPU used", "{cpu_share:.0%} of all cores used, {max_share:.0%} allowed"
     QUERIES_LATE = "queries are late: other programs or the disk delay them"
     MEMORY_OVER_LIMIT = "too much memory used", "{used_mb:.0f} MB of memory used, {max_mb:.0f} MB allowed"
-    RESOURCES_FREE = "resources are free again"
+    RESOURCES_FREE = "resource use is back to normal"
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,8 +190,8 @@ def _format_time_left(elapsed_s: float, done: int, total: int) -> str:
     return f", {left_s:.0f} s left" if left_s < 100 else f", {left_s / 60:.0f} min left"
 
 
-def show_wait(text: str, stream: TextIO | None = None) -> None:
-    """Show on a terminal what the program is waiting for, on a line that the next call replaces; "" clears it."""
+def show_progress(text: str, stream: TextIO | None = None) -> None:
+    """Show on a terminal what the program is doing, on a line that the next call replaces; "" clears it."""
     stream = stream or sys.stderr
     if stream.isatty():
         stream.write(f"{text[:_TERMINAL_COLUMNS]:<{_TERMINAL_COLUMNS}}\r")

@@ -207,7 +207,7 @@ def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> floa
 
 
 def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> LevelledImage:
-    """Remove the distortion of `lens` (None: no distortion) from an image that is not warped otherwise. `overlay`: as
+    """Remove the distortion of `lens` (None: no distortion) from an image that needs no other warp. `overlay`: as
     in `level_image`. Raises ImageError if the image's aspect ratio differs from that of the calibration."""
     if lens is None:
         return LevelledImage(image, overlay, view)
@@ -257,7 +257,7 @@ class _CameraGeometry:
     """Geometry of an image when it was taken, as far as known; with a calibrated lens, of the undistorted image.
 
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the image, viewing direction),
-    of the airframe (nose, right, down), and of the level image (right, down in the image, to the ground).
+    of the airframe (forward, right, down), and of the level image (right, down in the image, to the ground).
     `straight`: rotation from lens to level image without a turn about the vertical. `tilt_deg`: angle between the
     viewing direction and straight down; `is_too_tilted`: it is too large for a warp. `top_deg`: compass direction of
     the image's top. `footprint_m`: ground length of the longest side if the image were level. `corners` (3, n):
@@ -326,7 +326,7 @@ def _choose_attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | 
 
 
 def _rotate_body_to_level(roll_deg: float, pitch_deg: float) -> Doubles:
-    """Return the rotation (3, 3) from the airframe's axes (nose, right, down) to those of a level airframe."""
+    """Return the rotation (3, 3) from the airframe's axes (forward, right, down) to those of a level airframe."""
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
     about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]

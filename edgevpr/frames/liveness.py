@@ -71,19 +71,19 @@ class Liveness:
 
     def find_fault(self, now_s: float) -> Fault | None:
         """Return the fault of the source at this time, or None if there is none."""
-        silent_s, usual_s = now_s - self._waiting_since_s, LOST_AFTER_S
+        silent_s, timeout_s = now_s - self._waiting_since_s, LOST_AFTER_S
         if self._is_rate_known:
-            usual_s = min(max(LOST_AFTER_S, _MISSED_INTERVALS * median_low(self._intervals_s)), _MAX_TIMEOUT_S)
-        limit_s = usual_s if self._is_rate_known else _UNKNOWN_RATE_TIMEOUT_S
+            timeout_s = min(max(LOST_AFTER_S, _MISSED_INTERVALS * median_low(self._intervals_s)), _MAX_TIMEOUT_S)
+        limit_s = timeout_s if self._is_rate_known else _UNKNOWN_RATE_TIMEOUT_S
         if self._repeats >= _MIN_REPEATS and silent_s > _FROZEN_AFTER_S:
-            must_reopen = silent_s > max(self._frozen_reopen_s, usual_s)
-            return Fault(Condition.FROZEN, "frozen: the same picture again and again", must_reopen)
-        if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > usual_s:
+            must_reopen = silent_s > max(self._frozen_reopen_s, timeout_s)
+            return Fault(Condition.FROZEN, "frozen: the same picture keeps arriving", must_reopen)
+        if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > timeout_s:
             must_reopen = silent_s > max(_DAMAGED_REOPEN_S, limit_s)
             return Fault(Condition.DAMAGED, "damaged: no picture is complete", must_reopen)
         is_late = self._refusal is Refusal.LATE and now_s - self._refusal_s <= LOST_AFTER_S
         if silent_s > limit_s and is_late:
-            # Before the first picture, a key frame may be awaited, or more pictures from which to estimate their age.
+            # Before the first picture, it may still wait for a key frame, or for enough pictures to estimate their age.
             return Fault(Condition.LATE, _LATE_TEXT, silent_s > _LATE_REOPEN_S)
         if silent_s > limit_s:
             return Fault(Condition.LOST, "lost: no new picture", True)

@@ -129,7 +129,7 @@ def _read_rows(csv_path: str | Path, required: Sequence[str] = _REQUIRED_COLUMNS
             raise UsageError(f"{where} must have as many values as line 1 has columns.")
         record = {name: value.strip() for name, value in row.items()}
         if "file" in required and record["file"] in names:
-            raise UsageError(f"{where}: `file` is `{record['file']}`, but must be a name that no earlier line has.")
+            raise UsageError(f"{where}: `file` is `{record['file']}`, but must be a name not used on an earlier line.")
         names.add(record.get("file", ""))
         records.append((where, record))
     return records

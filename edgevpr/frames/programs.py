@@ -94,7 +94,7 @@ def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     _terminate(process)
     if exit_code is None:
         raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_TIMEOUT_S:g} s")
-    raise OpeningError(f"{name} ended with code {exit_code}{errors.explain_exit()}")
+    raise OpeningError(f"{name} exited with code {exit_code}{errors.explain_exit()}")
 
 
 class ProgramCapture:

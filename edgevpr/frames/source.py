@@ -139,7 +139,7 @@ def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
 
 
 def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
-    """Read the tags of the images of a folder by path, as a `FolderSource` with these `positions` returns them. Raises
+    """Return the tags of a folder's images, keyed by path, as a `FolderSource` with these `positions` would. Raises
     UsageError for an unusable table."""
     tags = _read_table(folder, positions)
     return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}

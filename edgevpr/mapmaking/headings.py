@@ -64,7 +64,7 @@ def _measure_heading(
     turn_scale, shift = fit_similarity(src, dst)
     if not 1 / _MAX_SCALE < abs(turn_scale) < _MAX_SCALE:
         return None
-    # The ground moves opposite to the camera. In the picture, x points right and y down, which is backwards.
+    # The ground moves opposite to the camera. In the picture, x points right and y points down, towards the tail.
     bearing_deg = math.degrees(math.atan2(-shift.real, shift.imag))
     course_deg = math.degrees(math.atan2(east_m, north_m))
     return course_deg - bearing_deg - lens.up_deg, -math.degrees(math.atan2(turn_scale.imag, turn_scale.real))

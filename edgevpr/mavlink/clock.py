@@ -155,15 +155,15 @@ class AutopilotClock:
         return False
 
     def _handle_boot_time(self, kind: str, boot_ms: int) -> bool:
-        """Process the boot time in a message of `kind`. Returns True if the boot time has gone back."""
+        """Process the boot time in a message of `kind`. Returns True if the time since boot has gone backwards."""
         last_ms = self._boot_ms.get(kind)
         self._boot_ms[kind] = boot_ms
         if last_ms is None:
             return False
-        is_wrapped = last_ms > _WRAP_MS - _WRAP_MARGIN_MS and boot_ms < _WRAP_MARGIN_MS
-        is_back = boot_ms < last_ms - _MIN_STEP_BACK_S * 1e3 and not is_wrapped
-        self._is_same_boot |= not is_back
-        return is_back
+        has_wrapped = last_ms > _WRAP_MS - _WRAP_MARGIN_MS and boot_ms < _WRAP_MARGIN_MS
+        went_back = boot_ms < last_ms - _MIN_STEP_BACK_S * 1e3 and not has_wrapped
+        self._is_same_boot |= not went_back
+        return went_back
 
     def _handle_utc(self, message: Message, now_s: float) -> None:
         """Process a SYSTEM_TIME: UTC and boot time of one instant, from one clock. Their difference is constant except
@@ -180,7 +180,7 @@ class AutopilotClock:
 
 class ReportDelay:
     """Decides from their delay whether the autopilot's reports are used, and announces changes. `is_late`: the newest
-    report arrived more than MAX_REPORT_DELAY_S after it was sent, because the link is full or our process paused."""
+    report arrived over MAX_REPORT_DELAY_S after it was sent, because the link is saturated or our process paused."""
 
     def __init__(self, announce: Announce) -> None:
         self.is_late = False
@@ -193,10 +193,10 @@ class ReportDelay:
         if self.is_late:
             if self._late_s is None:
                 log.warning(
-                    "the autopilot's reports arrive %.1f s late and are not used: the link is full; raise its baud "
-                    "rate, or have the other programs on the link request fewer messages", delay_s,
+                    "the autopilot's reports arrive %.1f s late and are not used: the link is saturated; raise its "
+                    "baud rate, or have the other programs on the link request fewer messages", delay_s,
                 )  # fmt: skip
-                self._announce(Severity.WARNING, f"link full: reports {delay_s:.1f} s late", "delay")
+                self._announce(Severity.WARNING, f"link saturated: reports {delay_s:.1f} s late", "delay")
             self._late_s = now_s
         elif self._late_s is not None and now_s - self._late_s > _MIN_PUNCTUAL_S:
             self._late_s = None

@@ -271,7 +271,7 @@ class Conversation:
             log.warning("the autopilot has no origin: setting it to the first place of the map, altitude %s", altitude)
             self._has_set_origin = True
         if origin.alt_m is None:
-            self.announce(Severity.WARNING, f"origin altitude unknown: about {alt_m:.0f} m", "origin")
+            self.announce(Severity.WARNING, f"origin altitude unknown: assuming {alt_m:.0f} m", "origin")
         return messages.make_origin(system_id, origin.lat_deg, origin.lon_deg, alt_m)
 
     def _request_reports(self, system_id: int, now_s: float) -> None:

@@ -145,7 +145,7 @@ class PortDriver:
             has_old_clock = OLD in self._settings.signing.verdicts
             is_behind = has_old_clock and not self._conversation.autopilot.is_alive(self._turns.now_s())
         if has_heartbeat or is_behind:
-            writer.port.reply_to_sender()
+            writer.port.adopt_sender_as_peer()
 
     def _transmit(self, writer: PacketWriter) -> None:
         while True:

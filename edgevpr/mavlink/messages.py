@@ -174,7 +174,7 @@ def make_odometry(
     east, north, down = state.velocity_m_s
     to_earth = rotmat.Matrix3()
     to_earth.from_euler(*attitude)
-    velocity = to_earth.transposed() * rotmat.Vector3(north, east, down)  # along nose, right, down
+    velocity = to_earth.transposed() * rotmat.Vector3(north, east, down)  # forward, right, down
     # Upper triangle of the 6 x 6 covariance, row by row: only the diagonal is known.
     pose_variances, velocity_variances = [0.0] * 21, [0.0] * 21
     pose_variances[0] = pose_variances[6] = math.sqrt(state.accuracy_m**3 / 2)

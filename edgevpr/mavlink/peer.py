@@ -110,8 +110,8 @@ class Listener:
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Handle a report of the vehicle's position and velocity."""
 
-    def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
-        """Handle the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude at that time."""
+    def handle_specific_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
+        """Handle the specific force at `t_s` (m/s^2 forward, right and down), and the attitude at that time."""
 
     def trusts_gps(self) -> bool:
         """Return False while matches prove the GPS receiver wrong."""
@@ -240,7 +240,7 @@ class Autopilot:
         if kind in _TIMED_REPORTS:
             self.report_delay.update(self.clock.delay_s(message.time_boot_ms, now_s), now_s)
         if kind in _MOTION_REPORTS and self.report_delay.is_late:
-            return  # an outdated report: the link is full, or our process was paused
+            return  # an outdated report: the link is saturated, or our process was paused
         match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
                 entry = mavlink.enums["MAV_RESULT"].get(message.result)
@@ -264,7 +264,7 @@ class Autopilot:
             case "SCALED_IMU" if attitude := self.attitudes.interpolate(now_s):
                 self.imu_s = now_s
                 force_m_s2 = tuple(axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
-                self._listener.handle_force(now_s, force_m_s2, attitude)
+                self._listener.handle_specific_force(now_s, force_m_s2, attitude)
             case "SCALED_PRESSURE" if _MIN_HPA < message.press_abs < _MAX_HPA:
                 self.pressure_alt_m = 44330.8 * (1 - (message.press_abs / 1013.25) ** 0.190263)
             case "GPS_GLOBAL_ORIGIN":

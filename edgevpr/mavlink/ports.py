@@ -57,7 +57,7 @@ class Port:
             return os.write(self.fileno(), data)
         return 0
 
-    def reply_to_sender(self) -> None:
+    def adopt_sender_as_peer(self) -> None:
         """From now on, send to the sender of the last bytes read. No effect if there can be only one sender."""
 
     def unsent(self) -> int:
@@ -101,7 +101,7 @@ class UdpOutPort(Port):
 
 
 class UdpInPort(Port):
-    """A listening UDP socket. It sends to the first sender until `reply_to_sender` selects another one."""
+    """A listening UDP socket. It sends to the first sender until `adopt_sender_as_peer` selects another one."""
 
     def __init__(self, host: str, port: int) -> None:
         # No SO_REUSEADDR: with it, a second program on the port would silently receive the first one's datagrams.
@@ -113,7 +113,7 @@ class UdpInPort(Port):
         with suppress(BlockingIOError):
             data, self.sender = self._sock.recvfrom(READ_BYTES)
             if self._peer is None:
-                self.reply_to_sender()
+                self.adopt_sender_as_peer()
             return data
         return b""
 
@@ -122,7 +122,7 @@ class UdpInPort(Port):
             return self._sock.sendto(data, self._peer) if self._peer else 0
         return 0
 
-    def reply_to_sender(self) -> None:
+    def adopt_sender_as_peer(self) -> None:
         self._peer, self.connected = self.sender, self.sender is not None
 
 
@@ -192,7 +192,7 @@ _ADVICE = {  # by error, and whether the link is serial
 
 def open_port(address: LinkAddress) -> Port:
     """Open the port of a link. Raises LinkAddressError for a wrong address, LinkError for another fault that the user
-    must correct (a port in use, no permission), and OSError for a fault that may end without action (no device)."""
+    must correct (a port in use, no permission), and OSError for a fault that may clear by itself (no device)."""
     is_serial = address.kind == "serial"
     try:
         return _PORT_TYPES[address.kind](address.target, address.number)

@@ -148,7 +148,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             self.other_systems |= {message.get_srcSystem()} if is_heartbeat else set()
             return False
         if is_heartbeat:
-            self._port.reply_to_sender()
+            self._port.adopt_sender_as_peer()
         elif not self.received:
             return False
         self.received[message.get_type()] += 1

@@ -145,22 +145,22 @@ def read_recorded_position(place: Place) -> Point:
     return (recorded.lat_deg, recorded.lon_deg) if recorded else to_point(place)
 
 
-def measure_inconsistent_tags(ground: Sequence[Place]) -> dict[int, float]:
+def measure_inconsistent_tags(places: Sequence[Place]) -> dict[int, float]:
     """Return the distance in metres, by place number, from the recorded position of a place to its refined one, for the
     places with an inconsistent tag (see `find_inconsistent_tags`)."""
     moved_m = {
         place.place_id: float(distance_m(*read_recorded_position(place), *to_point(place)))
-        for place in ground
+        for place in places
         if place.pose and place.pose.recorded
     }
     inconsistent = find_inconsistent_tags(np.array(list(moved_m.values())))
     return {place_id: moved_m[place_id] for place_id in compress(moved_m, inconsistent)}
 
 
-def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]:
+def find_gaps(places: Sequence[Place]) -> tuple[list[list[Point]], float, float]:
     """Find the gaps between pictures: ground that none of them shows. Return their outlines, the area shown and the
     area of the gaps, in m2; no outlines and zeros if no place has a pose."""
-    posed = [(place, place.pose) for place in ground if place.pose]
+    posed = [(place, place.pose) for place in places if place.pose]
     if not posed:
         return [], 0.0, 0.0
     from edgevpr.frames.images import cv2

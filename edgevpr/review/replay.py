@@ -13,7 +13,7 @@ from typing import Any
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, build, list_keys
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.text import show_wait
+from edgevpr.core.text import show_progress
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
@@ -87,7 +87,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
                 flight.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
-        show_wait("")
+        show_progress("")
         return ReplayResult(
             flown=flown,
             lines=list(read_log(replay_log)) if replay_log else [],
@@ -110,7 +110,7 @@ def _silence_log() -> Iterator[None]:
 
 def _read_frame(folder: Path, number: int) -> Image:
     """Read a recorded frame. Raises TapeEnded if it cannot be read, for example after a power cut."""
-    show_wait(f"replaying  {number}")
+    show_progress(f"replaying  {number}")
     try:
         return read_image(frame_path(folder, number))
     except ImageError as error:

@@ -135,7 +135,8 @@ class CoHog:
         grey, allowed = make_grey_square(image, self.w1), make_mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
         grey = stretch_contrast(grey, allowed, pixel_px, *tuning.CONTRAST[self.camera])
-        blocks, seen, good = self._make_good_blocks(grey, allowed, self.w2)
+        blocks, seen = self._make_blocks(grey, allowed, self.w2)
+        good = find_good_blocks(round_levels(grey), self.entropy, self.w2, self.gt, eligible=seen)
         regions = blocks.reshape(-1, 4 * self.bins)
         # Store square roots in 8 bits: most values are small, and square roots preserve their precision better.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
@@ -150,15 +151,13 @@ class CoHog:
             coarse=coarse, fine=stored, regions=regions, good=good.ravel(), quality=quality, picture=picture
         )
 
-    def _make_good_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
-        """Describe a square image, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
-        4 bins); bool (n, n), True for seen blocks, which have only `allowed` pixels; and bool (n, n), True for good
-        blocks: seen ones whose entropy is at least `gt`."""
+    def _encode_view(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
+        """Encode a view (see `views.Encode`). Good blocks have only `allowed` pixels and at least the entropy `gt`."""
         blocks, seen = self._make_blocks(grey, allowed, cell_px)
-        return blocks, seen, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, eligible=seen)
+        return blocks, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, eligible=seen)
 
     def _make_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
-        """Return the first two results of `_make_good_blocks`."""
+        """Return a square image's blocks, float32 (n, n, 4 bins), and bool (n, n), True for fully `allowed` ones."""
         blocks = normalise_blocks(compute_histograms(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)
@@ -328,11 +327,12 @@ class CoHog:
         return self._make_views(query).make_regions(number, self._make_vectors)
 
     def _make_views(self, query: Descriptor) -> QueryViews:
+        """Return the rotated and scaled views of `query`, cached for the latest query."""
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
                 raise ValueError("a place that was read from a map cannot be a query")
-            square = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
-            self._views = QueryViews(query.picture, square, self.w2, lambda *view: self._make_good_blocks(*view)[::2])
+            unchanged = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
+            self._views = QueryViews(query.picture, unchanged, self.w2, self._encode_view)
             self._query = query
         return self._views
 

@@ -171,7 +171,7 @@ class Hog(VectorTechnique):
                 f"hog cannot use w1={w1}, cell={cell}, bins={bins}: w1 must be a multiple of cell (at least 2 cells "
                 "of 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
-        self._w1, self._cell, self._bins = w1, cell, bins
+        self._side_px, self._cell, self._bins = w1, cell, bins
         length = (w1 // cell - 1) ** 2 * 4 * bins
         # Every wrong match on corridor and aerial_caliterra (the data sets used for tuning) had a margin below 0.022
         # (float), 0.024 (8bit), 0.017 (1bit).
@@ -179,8 +179,8 @@ class Hog(VectorTechnique):
         super().__init__("hog", length, parameters={"w1": w1, "cell": cell, "bins": bins}, form=form, margins=margins)
 
     def make_vector(self, image: Image, mask: Mask | None) -> Singles:
-        """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are ignored."""
-        grey = make_grey_square(image, self._w1)
-        allowed = make_mask_square(mask, self._w1)
+        """Encode uint8 (H, W[, 3]) as float32 (length,); gradients where `mask` bool (H, W) is False are ignored."""
+        grey = make_grey_square(image, self._side_px)
+        allowed = make_mask_square(mask, self._side_px)
         cells = compute_histograms(grey, self._cell, self._bins, signed=False, allowed=allowed)
         return normalise_blocks(cells).ravel()

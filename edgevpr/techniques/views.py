@@ -128,7 +128,7 @@ class QueryViews:
         return grey, cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
 
     def _warp_picture(self, ratio: float, steps: int) -> tuple[Array, Array, int]:
-        """Return the picture of the view of the height ratio `ratio`, rotated by `steps` steps of 15 degrees: grey
+        """Return the picture as seen at the height ratio `ratio`, rotated by `steps` steps of 15 degrees: grey
         float32 (side, side); bool (side, side), True for allowed pixels; and the side of a cell in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = count_cells(self._side + 1, ratio) * cell_px

@@ -28,7 +28,7 @@ _MIN_TURNS = 4
 _MIN_TURN_RAD = 0.3
 _MIN_RIVAL_OFFSET_S = 4.0
 _MAX_COST_RATIO = 0.9
-Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as in `mapmaking.refine.Tie`
+Move = tuple[complex, complex]  # shift, and logarithm of scale and turn, as in `mapmaking.refine.Tie`
 
 
 def estimate_clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
@@ -73,13 +73,13 @@ def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
 
 def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     """Return, for every three consecutive pictures that overlap, the index of the first and the logarithm of the
-    complex factor by which the motion changes."""
+    complex factor by which the motion changes. The turn converts the second motion to the frame of the first."""
     moves = [_measure_move(first, second) for first, second in pairwise(_describe_landmarks(paths))]
-    changes = {
-        index: np.log(second[0] / first[0]) + first[1]
-        for index, (first, second) in enumerate(pairwise(moves))
-        if first and second and first[0] and second[0]
-    }
+    changes: dict[int, complex] = {}
+    for index, (first, second) in enumerate(pairwise(moves)):
+        if first and second and first[0] and second[0]:
+            (shift, log_turn_scale), (next_shift, _) = first, second
+            changes[index] = np.log(next_shift / shift) + log_turn_scale
     return np.array(list(changes), int), np.array(list(changes.values()), complex)
 
 

@@ -28,7 +28,7 @@ def read_subtitles(path: Path) -> Record:
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
-        raise UsageError(f"{path} cannot be read ({error.strerror}): pass the .SRT file next to the video.") from error
+        raise UsageError(f"{path} cannot be read ({error.strerror}): pass the .SRT file of the video.") from error
     track = make_track(path, _read_blocks(text))
     return Record(kind="subtitles of a video", track=track, is_utc=False)
 

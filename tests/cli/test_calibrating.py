@@ -61,7 +61,7 @@ def read_calibration_of(path):
 def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     assert build_map(path, flight / "ref") == 0
-    assert f"expect: {(found := read_calibration_of(path)).described()}\n" in capsys.readouterr().out
+    assert f"expect: {(found := read_calibration_of(path)).describe()}\n" in capsys.readouterr().out
     assert build_map(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 

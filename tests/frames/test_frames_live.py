@@ -209,7 +209,7 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
     [
         ([], Condition.LOST, "lost: no new picture"),
         (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: no picture is complete"),
-        ((make_shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture again and again"),
+        ((make_shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture keeps arriving"),
     ],
 )
 def test_source_without_new_images_is_reported_and_reopened(given, condition, text, live):

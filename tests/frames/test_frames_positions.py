@@ -94,8 +94,8 @@ def test_parse_time_refuses(text):
         ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
         ("b.jpg,46,2", "line 3 must have as many values"),
         ("b.jpg,ref,46,84,2,0,,,,", "line 3 must have as many values"),
-        (",ref,46,2,,,,", "line 3: `file` is ``, but must be a name that no earlier line has"),
-        ("0000.jpg,ref,46,2,,,,", "`file` is `0000.jpg`, but must be a name that no earlier line has"),
+        (",ref,46,2,,,,", "line 3: `file` is ``, but must be a name not used on an earlier line"),
+        ("0000.jpg,ref,46,2,,,,", "`file` is `0000.jpg`, but must be a name not used on an earlier line"),
     ],
 )
 def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, write_table):

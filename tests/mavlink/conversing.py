@@ -41,7 +41,7 @@ class RecordingListener(Listener):
     def handle_channel(self, channel):
         self.channels.append(channel)
 
-    def handle_force(self, t_s, force_m_s2, attitude):
+    def handle_specific_force(self, t_s, force_m_s2, attitude):
         self.forces.append((force_m_s2, attitude.roll_deg))
 
     def estimate_state(self, t_s):

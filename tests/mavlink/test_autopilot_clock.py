@@ -183,7 +183,7 @@ def test_delay_s_keeps_reports_of_a_full_link_from_being_used(is_the_way_back):
     texts = [text for _ in range(4) for text in report_late(autopilot, 1.2 if is_the_way_back else 0.0)]
     assert autopilot.vehicle.t_received_s - before.t_received_s < 2.0, "the vehicle is where it was last heard in time"
     assert autopilot.conversation.predict_vehicle(autopilot.clock.now_s).roll_deg is None
-    assert any("link full: reports" in text for text in texts)
+    assert any("link saturated: reports" in text for text in texts)
     autopilot.timesync_s = 0.0
     texts = [text for _ in range(12) for text in report_late(autopilot, 0.05)]
     assert autopilot.clock.now_s - autopilot.vehicle.t_received_s < 0.2

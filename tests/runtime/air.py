@@ -209,7 +209,7 @@ class SimFlight:
 
     def _report_force(self, acceleration_m_s2: np.ndarray) -> None:
         east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)
-        self.navigator.handle_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
+        self.navigator.handle_specific_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
 
     def _report(self, velocity: np.ndarray) -> None:
         here = offset_position(*HOME, *(self.at_m + self.off_m))

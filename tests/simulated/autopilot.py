@@ -141,7 +141,7 @@ class _Conversation:
         if message.get_type() == "HEARTBEAT":
             is_companion = message.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER
             if is_companion or self._companion is None:
-                self._port.reply_to_sender()
+                self._port.adopt_sender_as_peer()
             self._companion = sender if is_companion else self._companion
 
     def _send(self, messages: list[Message]) -> None:

@@ -110,11 +110,11 @@ def answer_queries(
         tracks_flight = options.follow and sequence == 1 and rule.confidence_rule is not None
         candidates = None if options.exact else options.candidates or technique.candidates
 
-        def make_recogniser(length: int, tracks_flight: bool) -> Recogniser:
+        def make_recogniser(sequence_length: int, tracks_flight: bool) -> Recogniser:
             return Recogniser(
                 FrameEncoder(technique=technique, gate=gate),
                 place_map,
-                Matcher(index, rule, make_sequence_search(length)),
+                Matcher(index, rule, make_sequence_search(sequence_length)),
                 meter,
                 settings=MatchSettings(candidates=candidates),
                 prior=prior,

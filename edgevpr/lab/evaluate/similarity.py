@@ -38,7 +38,7 @@ def add_unscored(truth: GroundTruth, queries: Sequence[str]) -> GroundTruth:
     return {name: truth.get(name) for name in queries}
 
 
-def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequence[str] | None = None) -> Quality:
+def assess_quality(label: str, scores: Doubles, truth: GroundTruth, references: Sequence[str] | None = None) -> Quality:
     """Compute the quality of `scores`, float (queries, references); `label` is their name in messages. Rows are the
     queries of `truth`, in its order, and columns are `references` (None: all names in `truth`, in natural order).
     Raises UsageError if the numbers do not match."""
@@ -58,6 +58,6 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
             score = row[ranked[0]] if len(ranked) else -math.inf
             rows.append((score, rank_of_first_correct(ranked, correct), bool(correct.any())))
     if not rows:
-        raise UsageError(f"{label}: the ground truth scores none of its queries: pass the matching ground truth.")
+        raise UsageError(f"{label}: the ground truth answers none of its queries: pass the matching ground truth.")
     columns = map(np.array, zip(*rows, strict=True))
     return Quality(technique=label, references=len(names), unscored=len(truth) - len(rows), **compute_quality(*columns))

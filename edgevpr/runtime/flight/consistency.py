@@ -129,7 +129,7 @@ def _is_flyable(one: PredictedFix, other: PredictedFix) -> bool:
 
 
 def _is_independent(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> bool:
-    """Return True if two fixes are at different places, or so far apart that no one wrong position explains both."""
+    """Return True if two fixes are at different places, or so far apart that no single wrong position explains both."""
     if other.match.shares_no_place_with(one.match):
         return True
     flown_m = other.path_point_m + other.predicted_m - one.path_point_m - one.predicted_m

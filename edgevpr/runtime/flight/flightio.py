@@ -167,8 +167,8 @@ def _open_optional(open_part: Callable[[], T]) -> T | None:
 
 @contextmanager
 def _handle_signals(stop: Stop) -> Iterator[None]:
-    """Context manager: SIGTERM and SIGINT call `stop`, and end the process after four seconds. SIGHUP is ignored:
-    closing a terminal must not end a flight."""
+    """Context manager: SIGTERM and SIGINT call `stop`, and kill the process if it still runs after four seconds.
+    SIGHUP is ignored: closing a terminal must not end a flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
     handlers[signal.SIGHUP] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
@@ -177,7 +177,7 @@ def _handle_signals(stop: Stop) -> Iterator[None]:
     # Python calls `stop` in the main thread, which may hang, but writes the signal number to the pipe at once.
     before_writer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     has_ended = threading.Event()
-    watch = threading.Thread(target=_end_in_time, args=(reader, has_ended), name="end", daemon=True)
+    watch = threading.Thread(target=_force_exit_if_hung, args=(reader, has_ended), name="end", daemon=True)
     watch.start()
     try:
         yield
@@ -191,12 +191,12 @@ def _handle_signals(stop: Stop) -> Iterator[None]:
         os.close(reader)
 
 
-def _end_in_time(reader: int, has_ended: threading.Event) -> None:
-    """End the process if a signal arrives through the pipe `reader` and `has_ended` is not set soon after. The flight
-    log is in its file by then."""
+def _force_exit_if_hung(reader: int, has_ended: threading.Event) -> None:
+    """Kill the process if a signal arrives through the pipe `reader` and `has_ended` is not set soon after. By then the
+    flight log has been written."""
     while number := os.read(reader, 1):
         if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_MAX_END_S):
-            text = "the flight does not stop on the signal: ending its process"
+            text = "the flight did not stop on the signal: killing the process"
             # In a thread, because the hanging thread may be inside a log call.
             warning = threading.Thread(target=_log.warning, args=(text,), daemon=True)
             warning.start()

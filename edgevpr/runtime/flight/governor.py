@@ -1,5 +1,5 @@
 """The governor keeps CPU load, memory and temperature within the board's profile. It first compares fewer candidates,
-which costs few matches, then makes fewer queries per second, and steps back up when resources are free.
+which costs few matches, then makes fewer queries per second, and steps back up when resource use is normal.
 
 It steps up only if the load, scaled to the higher setting, stays clearly below every limit. If a step up soon had to be
 undone, it waits twice as long before the next one.
@@ -65,7 +65,7 @@ def list_settings(configured: Setting, keeps_rate: bool, fewer: Sequence[int] = 
 
 class Governor:
     """Decides which of the `settings` (highest first) is in force: it steps down when a limit of the `board`, or the
-    temperature `limit_c` (degrees Celsius), is exceeded, and up when resources are free again."""
+    temperature `limit_c` (degrees Celsius), is exceeded, and up when resource use is back to normal."""
 
     def __init__(self, board: Board, limit_c: float, settings: Sequence[Setting]) -> None:
         self._board, self._limit_c, self._settings, self._index = board, limit_c, list(settings), 0

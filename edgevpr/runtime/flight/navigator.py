@@ -142,8 +142,8 @@ class Navigator(Listener):
             has_gps = navigation.has_gps and not self._channel.is_continuous
             self.age.add_motion(vehicle.t_received_s, navigation.path_velocity_m_s, vehicle.heading_deg, has_gps)
 
-    def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
-        """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
+    def handle_specific_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
+        """Process the specific force that the accelerometers measure, m/s2 (forward, right, down), and the attitude."""
         acceleration_m_s2 = to_ground_acceleration(force_m_s2, attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
         self._attitude = attitude
         self._navigation.add_acceleration(t_s, acceleration_m_s2)

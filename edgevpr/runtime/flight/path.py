@@ -86,7 +86,7 @@ def to_ground_acceleration(
     force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float
 ) -> Doubles:
     """Return the acceleration over the ground (2,), east and north, from the specific force that accelerometers measure
-    (nose, right, down) at an attitude. Gravity is vertical and does not contribute."""
+    (forward, right, down) at an attitude. Gravity is vertical and does not contribute."""
     roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
     ahead, right, down = force_m_s2
     low = right * math.sin(roll) + down * math.cos(roll)

@@ -180,7 +180,7 @@ def read_recorded(log: str | Path) -> tuple[list[Line], Path]:
         raise UsageError(f"The last flight of {log} was not recorded: set `log: {{record: FOLDER}}` before the flight.")
     folder = find_recording(folder_name, log)
     if folder is None:
-        raise UsageError(f"The recording of {log} is neither at {folder_name} nor next to the log: copy it there.")
+        raise UsageError(f"The recording of {log} is neither at {folder_name} nor next to the log: copy it to either.")
     return lines, folder
 
 

@@ -57,7 +57,7 @@ class Vitals:
         self._minute_due_s = self._report_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
         self._source_fault: str | None = None
         self._start_s = self._last_explained_s = self._report_due_s
-        self._has_log = True
+        self._is_logging = True
         failing = Reason(ReasonCode.FRAMES_FAILING, {"frames": MAX_FAILURES_IN_A_ROW})
         self._failing = Alert(parts.notifier, "failing", failing, ReasonCode.FRAMES_RECOVERED)
         self._no_texture = Alert(parts.notifier, "camera", Reason(ReasonCode.IMAGE_BLANK), ReasonCode.GROUND_VISIBLE)
@@ -129,12 +129,12 @@ class Vitals:
 
     def _check_log(self) -> None:
         """Report to the ground station when logging fails and when it resumes; the journal has the cause."""
-        has_log = self._parts.io.machine.is_written(self._parts.flight_log)
-        if has_log != self._has_log:
-            self._has_log = has_log
-            text = f"flight log {'has resumed' if has_log else 'cannot be written'}"
+        is_logging = self._parts.io.machine.is_written(self._parts.flight_log)
+        if is_logging != self._is_logging:
+            self._is_logging = is_logging
+            text = f"flight log {'resumed' if is_logging else 'cannot be written'}"
             if self._parts.link:
-                self._parts.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
+                self._parts.link.announce(Severity.INFO if is_logging else Severity.WARNING, text, "log")
 
     def _assess_health(self) -> Health:
         if self._source_fault or self._frozen.is_frozen:

@@ -206,5 +206,5 @@ def _format_result(name: str, measure: SurveyMeasure) -> tuple[str, str]:
         return f"the map is {size}, +-{measure.sd:.1%}", f"map is {size}"
     sides = ("behind", "ahead") if name == "ahead_deg" else ("left", "right")
     side, key = sides[value > 0], f"source.mount_{name}"
-    looks = f"looks {abs(value):.1f} degrees {side}"
-    return f"the camera {looks} of straight down, +-{measure.sd:.1f}: set {key}: {value:.1f}", f"camera {looks}"
+    tilt_text = f"looks {abs(value):.1f} degrees {side}"
+    return f"the camera {tilt_text} of straight down, +-{measure.sd:.1f}: set {key}: {value:.1f}", f"camera {tilt_text}"

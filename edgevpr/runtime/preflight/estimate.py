@@ -142,12 +142,12 @@ def _recommend(
     )
 
 
-def _list_notes(board: Board, times: str, unknown: list[str]) -> Iterator[str]:
+def _list_notes(board: Board, timing_method: str, unknown: list[str]) -> Iterator[str]:
     score = board.benchmark_score
-    if times == "counted":
+    if timing_method == "counted":
         unverified = "" if score.verified else "unverified; "
         yield (
-            f"The times of cohog are computed from its instruction counts on an ARM core (`make bench-arm64`), at "
+            f"The cohog times are computed from its instruction counts on an ARM core (`make bench-arm64`), at "
             f"{score.arm64_mips:g} million instructions per second ({unverified}{score.source})."
         )
     if unknown:

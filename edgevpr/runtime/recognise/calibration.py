@@ -58,7 +58,7 @@ class MapCalibration:
             "twins": self.look_alikes.twins if self.look_alikes else None,
         }
 
-    def described(self) -> str:
+    def describe(self) -> str:
         """Describe the calibration in one sentence: accepted and wrong matches, and places hard to recognise."""
         wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'} accepted"
         warning = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""

@@ -99,7 +99,7 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate
         return None
     if config.entropy > MAX_ENTROPY:
         raise ConfigError(
-            f"`salience.entropy` is {config.entropy:g}, but must be at most {MAX_ENTROPY:.3f}, the maximum of an image."
+            f"`salience.entropy` is {config.entropy:g}, but must be at most {MAX_ENTROPY:.3f}, the highest possible."
         )
     memorability = detector = None
     if config.memorability > 0:

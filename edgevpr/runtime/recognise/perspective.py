@@ -80,8 +80,8 @@ class ObservedTilt:
 
     def get_sd(self, is_reported: bool) -> float:
         """Return the standard deviation of the tilt used for levelling, as a tangent. A reported tilt is trusted unless
-        the pictures clearly contradict it. If no tilt is reported, the error is the whole tilt plus that of this
-        measurement: if few regions agree, they are close together and show too small a tilt (tilt_ariel)."""
+        the pictures clearly contradict it. Without one, the error is the full measured tilt plus its measurement error,
+        because it is measured too small if only a few, clustered regions agree, as in the data set tilt_ariel."""
         if is_reported:
             return math.hypot(self.tangent, self.sd) if self.is_clear else 0.0
         return self.tangent + self.sd

@@ -5,8 +5,8 @@ import math
 
 from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG, View
 
-# Relative standard deviation of the height, before matches show it. Chosen on tilt_ariel, as was the factor: the
-# errors of its positions exceed the variation of its heights by that factor.
+# Relative standard deviation of the height, before matches show it. Chosen on the data set tilt_ariel, as was the
+# factor: the errors of its positions exceed the variation of its heights by that factor.
 UNKNOWN_HEIGHT_SD = 0.13
 _SCATTER_FACTOR = 1.5
 _UNKNOWN_WEIGHT = 3.0  # weight of UNKNOWN_HEIGHT_SD, in matches

@@ -57,7 +57,7 @@ class SalienceGate:
         self.reset()
 
     def reset(self) -> None:
-        """Prepare for another flight: discard the usual entropy and the last result of the detector."""
+        """Prepare for another flight: discard the entropy history and the last result of the detector."""
         self._entropies: deque[float] = deque(maxlen=_MAX_FRAMES)
         self._until_detection = 0
         self._static: Mask | None = None

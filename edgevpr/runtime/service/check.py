@@ -9,7 +9,7 @@ from pathlib import Path
 from edgevpr.core.config import Config, MavlinkConfig, SourceConfig, load_config
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import show_wait
+from edgevpr.core.text import show_progress
 from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
@@ -46,11 +46,11 @@ def check_configuration(config_path: str | Path, *, offline: bool = False) -> li
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
     except ConfigError as error:  # the map is opened within the limits of the board
         findings.append(report_error("board", error))
-    show_wait("opening the source" if offline else f"waiting up to {FRAME_WAIT_S:g} s for a frame from the source")
+    show_progress("opening the source" if offline else f"waiting up to {FRAME_WAIT_S:g} s for a frame from the source")
     findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
-    show_wait("waiting for the flight controller")
+    show_progress("waiting for the flight controller")
     findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
-    show_wait("")
+    show_progress("")
     return [*findings, run_check("log", lambda what: check_log(what, config.log.path))]
 
 
@@ -62,7 +62,7 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
         technique, confidence = explain_technique(recogniser, is_named=config.technique is not None), None
         if recogniser.rule.confidence_rule:
             calibration = read_calibration_for(place_map)
-            confidence = calibration.described() if calibration else explain_not_calibrated(len(place_map))
+            confidence = calibration.describe() if calibration else explain_not_calibrated(len(place_map))
     settings, machine = config.mavlink, read_model() or "this machine"
     if not board.is_this_machine():
         machine += f", not on {board.title}"

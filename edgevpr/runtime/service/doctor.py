@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkError
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import show_wait
+from edgevpr.core.text import show_progress
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.requestlink import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
@@ -34,10 +34,10 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
     if (uri := source.uri) and is_live(uri):
         camera_findings = list(check_camera(uri))
         if all(finding.ok for finding in camera_findings):
-            show_wait(f"waiting for a frame of {uri}")
+            show_progress(f"waiting for a frame of {uri}")
             camera_findings.append(run_check("frames", lambda what: check_frame(what, source)))
         machine_findings += camera_findings
-    show_wait(f"querying the autopilot at {address}")
+    show_progress(f"querying the autopilot at {address}")
     reading = None
     try:
         with RequestLink(address, settings.component_id, settings.system_id, signing) as link:
@@ -48,7 +48,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
                 autopilot_findings = [explain_silence(address, link)]
     except LinkError as error:
         reading, autopilot_findings = None, [report_error("link", error)]
-    show_wait("")
+    show_progress("")
     return autopilot_findings + machine_findings, reading
 
 

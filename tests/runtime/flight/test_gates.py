@@ -159,7 +159,7 @@ def test_navigator_sends_no_unknown_contradicted_or_withdrawn_position():
 
 def test_continuous_position_claims_the_accuracy_of_fifty_correlated_ones():
     navigator = navigate(Channel.GPS_INPUT, reports={"sink_m_s": 0.7}, map_sd_m=1.0)
-    navigator.handle_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
+    navigator.handle_specific_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
     state = navigator.estimate_state(NOW_S)
     assert (state.t_mono_s, state.alt_m, state.alt_accuracy_m, state.is_fallback) == (NOW_S, 300.0, 3.0, False)
     assert (state.lat_deg, state.lon_deg) == pytest.approx(HOME)

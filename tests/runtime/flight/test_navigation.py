@@ -32,7 +32,7 @@ class NavigatedFlight(SimFlight):
         self.navigation = Navigation(drift, 1.0)
         navigator = SimpleNamespace(
             handle_vehicle=self.navigation.add_report,
-            handle_force=self.handle_force if drift is INERTIAL else lambda *_: None,
+            handle_specific_force=self.handle_specific_force if drift is INERTIAL else lambda *_: None,
             estimate_state=self.navigation.estimate_state,
             make_interim_fix=lambda t_s: None,
         )
@@ -40,7 +40,7 @@ class NavigatedFlight(SimFlight):
         self.look = lambda t_s, seen_m: (seen_m, {})
         self.fly(gps_s).lose_gps()
 
-    def handle_force(self, t_s, force_m_s2, attitude):
+    def handle_specific_force(self, t_s, force_m_s2, attitude):
         self.navigation.add_acceleration(t_s, np.array(force_m_s2[1::-1]))
 
     def match(self, step, vehicle):
@@ -119,7 +119,7 @@ class ReceiverOnly:
             gps = receiver_at(where, 1.0, self.t_s, **known) if has_gps else None
             estimate = offset_position(*HOME, estimate_m, 0.0)
             known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
-            self.navigation.add_report(vehicle_at(*estimate, self.t_s, **known), is_estimate_ours=True)
+            self.navigation.add_report(vehicle_at(*estimate, self.t_s, **known), may_echo_ours=True)
         return self
 
     @property
