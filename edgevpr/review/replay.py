@@ -58,12 +58,12 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             f"{folder} is from a flight with a second link (`mavlink.ground`), which this version of edgevpr does not "
             f"have: replay it with edgevpr {header['version']}."
         )
-    config = build(Config, _drop_unknown_settings(header["config"]), str(folder))
+    config = build(Config, _drop_unknown_settings(header["config"], Config), str(folder))
     place_map = place_map or config.map
     if place_map and not Path(place_map).exists():
         raise UsageError(f"{place_map}, the map of the flight, does not exist: pass its path with --map.")
     playback = Playback(notes)
-    recorded = build(Board, header["board"], "the board of the flight")
+    recorded = build(Board, _drop_unknown_settings(header["board"], Board), "the board of the flight")
     board = resolve_board(recorded, config.source, config.memory)
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
@@ -117,15 +117,16 @@ def _read_frame(folder: Path, number: int) -> Image:
         raise TapeEnded(str(error)) from None
 
 
-def _drop_unknown_settings(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the settings of a recorded flight without those that this version no longer has, with a warning."""
-    settings, known_names = {}, {key.name for key in list_keys()}
-    for name, value in config.items():
+def _drop_unknown_settings(recorded: dict[str, Any], kind: type, prefix: str = "") -> dict[str, Any]:
+    """Return the settings of a recorded flight, of the dataclass `kind`, without those that this version no longer has,
+    with a warning."""
+    settings, known_names = {}, {key.name for key in list_keys(kind)}
+    for name, value in recorded.items():
         key_name = f"{prefix}{name}"
         if key_name in known_names:
             settings[name] = value
         elif isinstance(value, dict):
-            settings |= {name: section} if (section := _drop_unknown_settings(value, f"{key_name}.")) else {}
+            settings |= {name: section} if (section := _drop_unknown_settings(value, kind, f"{key_name}.")) else {}
         elif value not in (None, False):
             _log.warning("the flight had the setting `%s`, which this version of edgevpr does not recognise", key_name)
     return settings
