@@ -32,10 +32,11 @@ _MAX_SINGLE_MOTION = 0.04  # limit for one rotation, or one repeated image
 _PROOF_WINDOW_S = 20.0
 _MIN_FROZEN_S = 2.5  # of unchanged images, or between an image and its repetition
 # This many consecutive repeated images in flight are sufficient proof, unless the aircraft has come back: on a lap that
-# takes whole seconds, one image after another equals that of the lap before. A plane's dead reckoning was up to 30 % of
-# the distance wrong.
+# takes whole seconds, one image after another equals that of the lap before.
 _MIN_REPEATS = 8
-_MAX_RETURN_FRACTION = 0.5  # of the distance flown: an aircraft that is nearer to where it was has come back
+# Of the distance flown: an aircraft that is nearer to where it was has come back. A plane's dead reckoning was up to
+# 0.3 of the distance wrong.
+_MAX_RETURN_FRACTION = 0.5
 _ROTATION_ERROR_DEG = 2.0  # due to attitude and time of the frame
 _SPEED_ERROR_M_S = 2.0  # a lower speed counts as hovering
 _PATH_DRIFT_M_S = 6.0  # of a path over a minute, due to changing wind
@@ -109,10 +110,13 @@ class TimedImage:
     path_m: Doubles
     distance_m: float
 
+    def compute_displacement_m(self, earlier: "TimedImage") -> float:
+        """Return the straight distance from where an earlier image was taken."""
+        return float(np.hypot(*(self.path_m - earlier.path_m)))
+
     def has_returned_to(self, earlier: "TimedImage") -> bool:
-        """Return True if the aircraft has flown away from an earlier image and come back."""
-        moved_m = float(np.hypot(*(self.path_m - earlier.path_m)))
-        return moved_m < _MAX_RETURN_FRACTION * (self.distance_m - earlier.distance_m)
+        """Return True if the aircraft has flown away from where an earlier image was taken, and come back."""
+        return self.compute_displacement_m(earlier) < _MAX_RETURN_FRACTION * (self.distance_m - earlier.distance_m)
 
 
 class FrozenWatch:
@@ -218,7 +222,7 @@ class FrozenWatch:
             self._repeats.append((now.t_s, min(motion, _MAX_SINGLE_MOTION)))
 
     def _compute_travel_motion(self, earlier: TimedImage, now: TimedImage, speed_error_m_s: float) -> float:
-        moved_m = float(np.hypot(*(now.path_m - earlier.path_m))) - speed_error_m_s * (now.t_s - earlier.t_s)
+        moved_m = now.compute_displacement_m(earlier) - speed_error_m_s * (now.t_s - earlier.t_s)
         return self._optics.compute_travel_motion(moved_m, now.vehicle.height_m if now.vehicle else None)
 
     def _is_same(self, earlier: CoarseImage, now: CoarseImage, updates_static: bool = False) -> bool | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.geodesy import offset_position
+from edgevpr.core.geodesy import move_position
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix
@@ -286,7 +286,7 @@ class Navigation:
         velocity_m_s = point.velocity_m_s + error_m_s
         return NavState(
             t_s=t_s,
-            position=Position(*offset_position(path.origin.lat_deg, path.origin.lon_deg, *position_m.tolist())),
+            position=move_position(path.origin, *position_m.tolist()),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
             accuracy_m=math.hypot(compute_worst_sd(covariance[:2, :2]), self._odometry_since_fix.error_m),
             speed_accuracy_m_s=compute_worst_sd(covariance[2:, 2:]),

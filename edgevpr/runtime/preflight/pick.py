@@ -135,4 +135,6 @@ def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts | None:
         return measure_costs(technique)
     spec = technique.spec
     work = count_work(spec.name, spec.parameters) if _uses_vote(spec) else None
+    if work is None or board.benchmark_score.arm64_mips is None:
+        return None  # before the measurement, which takes seconds
     return compute_costs(measure_costs(technique), board, work)

@@ -40,7 +40,8 @@ _PYMAVLINK_MB = 12.0  # resident memory added by importing pymavlink (measured o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueCosts:
-    """Costs of a technique on one machine, measured or converted. A `StageCost` is wall time and CPU time.
+    """Costs of a technique on one machine: measured, or with times from instruction counts. A `StageCost` is wall time
+    and CPU time.
 
     `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
     file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than
@@ -48,8 +49,7 @@ class TechniqueCosts:
     after all places of the map are scanned in RAM (None: the technique has one stage, and compares all places).
     `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a query for the scan.
     `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`). `process_mb`: peak
-    resident memory of the process without a map. `is_network`: images are encoded by a network. `sequence`: number of
-    queries matched together.
+    resident memory of the process without a map. `sequence`: number of queries matched together.
     """
 
     encode: StageCost
@@ -63,7 +63,6 @@ class TechniqueCosts:
     compare_once: StageCost = NO_COST
     max_matches: int = 1
     tries_rotations: bool = False
-    is_network: bool = False
     sequence: int = 1
 
     def match(self, places: int) -> StageCost:
@@ -132,7 +131,6 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
         candidates=candidates if spec.fine else None,
         scan_per_place=scan_per_place if spec.fine else NO_COST,
         scan_once=scan_once,
-        is_network=spec.model_sha256 is not None,
         sequence=bench.sequence,
     )
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgevpr.core.arrays import Covariance, Doubles
-from edgevpr.core.geodesy import offset_m, offset_position, picture_axes
+from edgevpr.core.geodesy import move_position, offset_between_m, picture_axes
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Candidate, Place, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
@@ -139,10 +139,10 @@ def locate(
     agreeing_score = sum(estimate.score for estimate in agreeing)
     if sum(score for score, _ in contradicting) > _MAX_CONTRADICTION_RATIO * agreeing_score:
         objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": max(contradicting)[1]})
+    east_m, north_m = position_m.tolist()
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
-    lat_lon = offset_position(best.position.lat_deg, best.position.lon_deg, *position_m.tolist())
     return Located(
-        position=Position(*lat_lon, best.position.alt_m),
+        position=move_position(best.position, east_m, north_m, best.position.alt_m),
         covariance_m2=to_triple(covariance),
         heading_deg=(pose.up_deg + first.rotation_deg) % 360,
         height_ratio=first.height_ratio and first.height_ratio * view.zoom,
@@ -197,7 +197,7 @@ def _estimate_position(
         return None
     if place.position is None or pose is None or best.position is None or best.pose is None:
         return None
-    place_offset_m = _offset_m(best.position, place.position)
+    place_offset_m = np.array(offset_between_m(best.position, place.position))
     if float(np.hypot(*place_offset_m)) > (pose.footprint_m + best.pose.footprint_m) / 2:
         return None
     if agreement:
@@ -227,11 +227,6 @@ def _estimate_position(
         rotation_deg=rotation_deg,
         height_ratio=height_ratio,
     )
-
-
-def _offset_m(origin: Position, position: Position) -> Doubles:
-    """Return the offset of a position east and north of `origin` (2,), metres."""
-    return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 
 
 def to_triple(covariance: Doubles) -> Covariance:

@@ -29,6 +29,7 @@ from edgevpr.runtime.recognise.odometry import OdometryStep, VisualOdometry
 from edgevpr.runtime.recognise.perspective import CommonTilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
+from edgevpr.runtime.recognise.relief import Relief
 
 _log = logging.getLogger(__name__)
 _LATER_PASS_FRACTION = 0.4  # fraction of the candidates compared at each height except the first
@@ -81,7 +82,7 @@ class Recogniser:
             self.candidates = candidates
         if mount is not None:
             self.encoder = self.encoder.replace_mount(mount)
-            self._decider = replace(self._decider, common_tilt=CommonTilt())
+            self._decider = replace(self._decider, common_tilt=CommonTilt(), relief=Relief())
             self._odometry = VisualOdometry() if self._odometry else None  # the next frame has no odometry
 
     @property
