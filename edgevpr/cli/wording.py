@@ -75,7 +75,7 @@ def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
         yield f"  not linked  {not_tied} keep their recorded position: a fix there is only as accurate as the spacing"
     for place_id, image, distance_m in refined.contradictory:
-        yield f"  GPS tag     place {place_id} ({sanitize(image)}): recorded {distance_m:.0f} m from its true position"
+        yield f"  GPS tag     place {place_id} ({sanitize(image)}): {distance_m:.0f} m from its refined position"
 
 
 def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:

@@ -72,11 +72,11 @@ class View:
 
     `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
     `nadir_offset`: from the image's middle to the nadir, the point straight below the camera, (right, up) as fractions
-    of the longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt (see
-    `relief` for that due to its height). `zoom`: factor by which the image was enlarged: its longest side shows that
-    many times less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for an image that was not
-    warped because its lens is unknown. `focal`: focal length as a fraction of the longest side. `rotation_deg`:
-    clockwise rotation that was applied to the image.
+    of the longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt
+    (`recognise.relief` adds that due to the height of the ground). `zoom`: factor by which the image was enlarged: its
+    longest side shows that many times less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for
+    an image that was not warped because its lens is unknown. `focal`: focal length as a fraction of the longest side.
+    `rotation_deg`: clockwise rotation that was applied to the image.
     `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None

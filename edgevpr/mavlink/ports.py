@@ -71,11 +71,11 @@ class Port:
         self._sock.close()
 
 
-def _open_udp(connect: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
-    """Return a UDP socket attached to an address by `connect`: `bind` or `connect`. Close the socket if this fails."""
+def _open_udp(attach: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
+    """Return a UDP socket attached to an address by `attach`: `bind` or `connect`. Close the socket if this fails."""
     with ExitStack() as stack:
         sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        connect(sock, (host, port))
+        attach(sock, (host, port))
         stack.pop_all()
     return sock
 

@@ -30,7 +30,8 @@ _MAX_GAP_FOOTPRINTS = 1.0  # wider gaps that are open to one side are outside th
 _NOTES = (
     "Coverage gaps are between pictures that do not touch: each picture is assumed to show at least a square of three "
     "quarters of its long side.",
-    "A GPS tag is inconsistent if it is four times as far from its picture as usual in this map.",
+    "A GPS tag is inconsistent if it is more than four standard deviations (of this map) from its picture, and at "
+    "least 5 m.",
 )
 _NO_PICTURES = (
     "Look-alikes are only searched for with --map-images, in a `cohog` map whose places were built from these images "

@@ -109,8 +109,8 @@ class AutopilotOutput:
                 )
 
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
-        """Send the fix of an event, if any, and its figures. Return the event with the report of its
-        fix, and its accuracy in flight. `used_mah` is the charge that the board has drawn so far."""
+        """Send the fix of an event, if any, and its figures. Return the event with the report of its fix, and its
+        accuracy in flight. `used_mah` is the charge that the board has drawn so far."""
         with self._link.take_turn("use"):
             fix, transmission = None, None
             if event.accepted:

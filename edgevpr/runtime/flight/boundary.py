@@ -124,8 +124,8 @@ class TapedStop(Stop):
 
 class RecordedSource(Source):
     """A source that records the frames of `source`, and its attributes (see `Source`) whenever one is read.
-    `store_jpeg` stores the JPEG of a frame and returns its number. The flight uses the
-    image decoded from that JPEG, so a replay has exactly the images of the flight."""
+    `store_jpeg` stores the JPEG of a frame and returns its number. The flight uses the image decoded from that JPEG, so
+    a replay has exactly the images of the flight."""
 
     def __init__(self, source: Source, tape: Tape, store_jpeg: Callable[[bytes], int]) -> None:
         self.is_live, self.total = source.is_live, source.total

@@ -17,7 +17,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Consecutive accepted matches that must show the rotation, and the smallest rotation to report. With this length of
-# their mean direction they agree within about ten degrees. A compass error is smaller; cameras are off by 90 or 180.
+# their mean direction they agree within about ten degrees. A compass is rarely that far off; cameras are by 90 or 180.
 _TURN_MATCHES = 10
 _MIN_TURN_DEG = 20.0
 _MIN_MEAN_LENGTH = 0.97

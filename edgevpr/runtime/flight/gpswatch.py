@@ -26,8 +26,8 @@ _MIN_MEAN_MATCHES = 10
 _MAX_MEAN_MATCHES = 60
 _MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; 3 s at 1 Hz
 _MAX_MATCH_AGE_S = 30.0  # of the matches in a row
-_MIN_RECENT_MATCHES = 5  # contradicting matches, with or without agreeing ones between them
-_RECENT_WINDOW_S = 20.0
+_MIN_RECENT_OPPOSING = 5  # contradicting matches, with or without agreeing ones between them
+_RECENT_OPPOSING_S = 20.0
 _MAX_DRIFT_M_S = 10.0  # largest rate of the offset from GPS while a spoofer leads the receiver away
 _REPORT_FACTOR = 2.0  # increase of the distance after which it is reported again
 
@@ -45,7 +45,7 @@ class GpsWatch:
     def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
         self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
         self._opposing: list[tuple[PositionedMatch, Doubles]] = []  # contradicting matches, with offsets (2,) from GPS
-        self._recent: list[PositionedMatch] = []  # contradicting matches of the last seconds
+        self._recent_opposing: list[PositionedMatch] = []  # contradicting matches of the last seconds
         self._agreements = 0
         self._mean_error_m, self._mean_count = np.zeros(2), 0  # of the matches that agreed, and their number
         self._agreed_places: set[int] = set()  # places of the last match that agreed
@@ -56,7 +56,7 @@ class GpsWatch:
     def reset(self) -> None:
         """Discard the offsets from GPS so far, because later matches have different errors."""
         self._opposing.clear()
-        self._recent.clear()
+        self._recent_opposing.clear()
         self._mean_error_m, self._mean_count = np.zeros(2), 0
 
     def update(self, event: Recognition) -> None:
@@ -90,14 +90,16 @@ class GpsWatch:
         is_far = _is_beyond(error_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
         is_mean_known = self._mean_count >= _MIN_MEAN_MATCHES
         has_moved = is_mean_known and _is_beyond(error_m - self._mean_error_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
-        self._recent = [other for other in self._recent if match.t_s - other.t_s <= _RECENT_WINDOW_S]
+        self._recent_opposing = [
+            other for other in self._recent_opposing if match.t_s - other.t_s <= _RECENT_OPPOSING_S
+        ]
         if not is_far and not has_moved:
             self._opposing.clear()
             self._agreements += 1
             self._mean_count = min(self._mean_count + 1, _MAX_MEAN_MATCHES)
             self._mean_error_m = self._mean_error_m + (error_m - self._mean_error_m) / self._mean_count
             self._agreed_places = set(match.places)
-            if self._agreements >= _MIN_MATCHES_IN_A_ROW and len(self._recent) < _MIN_RECENT_MATCHES:
+            if self._agreements >= _MIN_MATCHES_IN_A_ROW and len(self._recent_opposing) < _MIN_RECENT_OPPOSING:
                 self.is_wrong, self._have_agreed = False, True
             return
         places, has_agreed = set(match.places), bool(self._agreed_places & set(match.places))
@@ -105,8 +107,8 @@ class GpsWatch:
         def is_independent_of(other: PositionedMatch) -> bool:
             return has_agreed or not set(other.places) >= places
 
-        if all(map(is_independent_of, self._recent)):
-            self._recent.append(match)
+        if all(map(is_independent_of, self._recent_opposing)):
+            self._recent_opposing.append(match)
         self._agreements = 0
         self._opposing = [
             (other, other_m)
@@ -116,7 +118,7 @@ class GpsWatch:
             and is_independent_of(other)
         ]
         self._opposing.append((match, error_m))
-        is_proven = len(self._opposing) >= _MIN_MATCHES_IN_A_ROW or len(self._recent) >= _MIN_RECENT_MATCHES
+        is_proven = len(self._opposing) >= _MIN_MATCHES_IN_A_ROW or len(self._recent_opposing) >= _MIN_RECENT_OPPOSING
         self.is_wrong = self.is_wrong or is_proven
 
 

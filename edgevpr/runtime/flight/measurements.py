@@ -126,7 +126,9 @@ def compute_picture_error_m(
     return math.hypot(attitude_sd * height_m, t_sd_s * speed_m_s)
 
 
-def add_frame_error(match_m: float, event: Recognition, vehicle: Vehicle, height_m: float, attitude_sd: float) -> float:
+def compute_reported_accuracy_m(
+    match_m: float, event: Recognition, vehicle: Vehicle, height_m: float, attitude_sd: float
+) -> float:
     """Return the accuracy (metres) to report for the match of an event: that of match and map (`match_m`) combined with
     the errors of the attitude (`attitude_sd`, a tangent; no effect at `height_m` 0) and of the frame's time."""
     t_sd_s, sweep_m_s = event.frame.t_sd_s if event.frame else 0.0, height_m * math.radians(vehicle.tilt_rate_deg_s)

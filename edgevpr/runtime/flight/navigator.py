@@ -20,7 +20,7 @@ from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
-    add_frame_error,
+    compute_reported_accuracy_m,
     compute_time_error_m,
     compute_worst_sd,
     measure_frame,
@@ -159,7 +159,7 @@ class Navigator(Listener):
         if frame is None or vehicle is None or event.located is None:
             return event
         match_m, height_m = max(self._map_sd_m, event.located.accuracy_m), frame.attitude_gain_s2 * GRAVITY_M_S2
-        accuracy_m = add_frame_error(match_m, event, vehicle, height_m, self._navigation.attitude_error_sd)
+        accuracy_m = compute_reported_accuracy_m(match_m, event, vehicle, height_m, self._navigation.attitude_error_sd)
         return replace(event, accuracy_m=accuracy_m)
 
     def advise(self, event: Recognition, now_s: float) -> Advice:

@@ -56,8 +56,8 @@ class Notifier:
 
 
 class Alert:
-    """Reports a fault once when it begins (`onset`), and once when it ends (`cleared`). `kind`: kind of its
-    lines in the flight log."""
+    """Reports a fault once when it begins (`onset`), and once when it ends (`cleared`). `kind`: kind of its lines in
+    the flight log."""
 
     def __init__(self, notifier: Notifier, kind: str, onset: Reason, cleared: ReasonCode) -> None:
         self.is_active = False
