@@ -1,4 +1,4 @@
-"""What an autopilot is asked about its parameters in flight, and what follows from late, lost and changed answers."""
+"""Requests for an autopilot's parameters in flight, and the effect of late, lost and changed answers."""
 
 import random
 from collections import Counter

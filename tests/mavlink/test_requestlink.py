@@ -1,4 +1,4 @@
-"""Questions to an autopilot over a real UDP link: answered, lost, refused, signed, and never answered."""
+"""Requests to an autopilot over a real UDP link: answered, lost, refused, signed, and never answered."""
 
 import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
@@ -22,7 +22,7 @@ def address() -> LinkAddress:
 
 
 @pytest.fixture(autouse=True)
-def _listens_briefly(monkeypatch):
+def _listen_briefly(monkeypatch):
     monkeypatch.setattr(module, "LISTEN_S", 0.2)
 
 

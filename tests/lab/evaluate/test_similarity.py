@@ -21,7 +21,7 @@ def truth(tmp_path):
 
 
 @pytest.mark.data
-def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
+def test_assess_quality_gives_the_published_figures_of_eight_matrices(capsys):
     if not _PUBLISHED.is_dir():
         pytest.skip("the published matrices are not here")
     with open(_PUBLISHED / "corridor_figures.csv") as handle:
@@ -50,7 +50,7 @@ def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
         (b"rubbish", "contains no similarities"),
     ],
 )
-def test_measure_refuses_inconsistent_input_in_one_sentence(tmp_path, truth, capsys, content, said):
+def test_assess_quality_refuses_inconsistent_input_in_one_sentence(tmp_path, truth, capsys, content, said):
     path = tmp_path / "a.npy"
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -59,7 +59,7 @@ def test_measure_refuses_inconsistent_input_in_one_sentence(tmp_path, truth, cap
     assert said in refused(capsys, "eval", "--similarity", path, "--ground-truth", truth, is_alone=True)
 
 
-def test_measure_counts_queries_off_the_map_and_breaks_ties_by_order(tmp_path, truth, capsys):
+def test_assess_quality_counts_queries_off_the_map_and_breaks_ties_by_order(tmp_path, truth, capsys):
     truth.write_text("query_file,ref_files,ref_files_loose\nq1,r1,\nq2,r2,\nq3,,\nq4,,r1 r2\n")
     np.save(tmp_path / "a.npy", [[0.9, 0.1], [0.5, 0.5], [0.7, 0.2], [0.1, 0.8]])
     found = run_json(capsys, "eval", "--similarity", tmp_path / "a.npy", "--ground-truth", truth)["similarities"]["a"]
@@ -68,7 +68,7 @@ def test_measure_counts_queries_off_the_map_and_breaks_ties_by_order(tmp_path, t
     assert (found["with_match"]["queries"], found["with_match"]["recall_at_1"]) == (2, 0.5)
 
 
-def test_measure_uses_all_images_of_the_folders(tmp_path, truth, capsys):
+def test_assess_quality_uses_all_images_of_the_folders(tmp_path, truth, capsys):
     for folder, names in (("query", ["q1", "q2", "q3", "q4"]), ("ref", ["r1", "r2", "r10", "r11"])):
         (tmp_path / folder).mkdir()
         for name in names:

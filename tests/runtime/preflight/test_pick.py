@@ -1,4 +1,4 @@
-"""What is said before a flight, and how few candidates its governor may have compared."""
+"""The technique picked before a flight, the measured time of a query, and the numbers of candidates that are safe."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -162,7 +162,7 @@ def test_judge_accepts_the_place_of_the_track_over_the_best_score():
 
 
 @pytest.mark.parametrize(("lead", "accepted"), [(0.0, True), (-0.01, False)])
-def test_judge_refuses_by_track_alone_what_another_place_beats_in_the_image(lead, accepted):
+def test_judge_never_accepts_by_track_alone_what_another_place_beats_in_the_image(lead, accepted):
     rule = make_rule(lambda evidence: 0.5)
     verdict = decide(rule=rule, evidence=replace(CLEAR, lead=lead), track_confidence=0.9999)
     assert verdict.accepted is accepted
@@ -180,7 +180,7 @@ def test_judge_applies_limits_in_addition_to_the_confidence(limit):
 
 
 @pytest.mark.parametrize("score", [math.nan, 0.019])
-def test_judge_does_not_compensate_low_confidence_with_a_high_score(score):
+def test_judge_does_not_compensate_a_low_score_with_a_high_confidence(score):
     assert not decide((score, 0.0), make_rule(lambda evidence: 1.0, min_verify_score=0.02), evidence=CLEAR).accepted
 
 

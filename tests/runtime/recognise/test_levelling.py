@@ -328,7 +328,7 @@ def test_enlarge_image_scales_around_the_centre(zoom):
 
 
 @pytest.mark.slow
-def test_the_accuracy_in_the_world_contains_an_error_of_the_reported_tilt(walk, ground):
+def test_accuracy_in_the_world_contains_an_error_of_the_reported_tilt(walk, ground):
     event = walk(make_scaling()).step(frame(ground, 1, told=LEVEL_POSE))
     assert is_recognised(event, 1)
     assert event.accuracy_m == pytest.approx(math.hypot(event.located.accuracy_m, 0.01746 * HEIGHT_M), rel=0.05)
