@@ -207,7 +207,7 @@ def build(
     """Build a map as `edgevpr map build` does. `progress` is called after each image (None: it is shown on stderr).
 
     `images`: a folder of images or a video, `FlightPictures` to specify more, or `OrthophotoGrid` for an orthophoto.
-    `camera`: "nadir" or "forward". `technique`: name (None: chosen automatically). `config`: flight configuration file
+    `camera`: "nadir" or "forward". `technique`: name (None: cohog). `config`: flight configuration file
     (None: the defaults). Images that cannot be used are left out with a warning; so is a refinement or
     calibration that is not possible. Raises EdgevprError.
     """

@@ -81,9 +81,8 @@ def add(commands: Any) -> None:
 
 def _add_build(build: ArgumentParser) -> None:
     _add_pictures(build)
-    build.add_argument("--technique", metavar="NAME", help="technique (default: chosen for the board)")
+    build.add_argument("--technique", metavar="NAME", help="technique (default: cohog)")
     add_parameters(build, "set a parameter of the technique")
-    build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
     build.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and salience are used)")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
     build.add_argument("--rate-hz", type=parse_positive, metavar="HZ", help="places per second of a video")
@@ -155,7 +154,6 @@ def run_map_build(args: Namespace) -> int:
         pictures=_parse_pictures(args),
         technique=args.technique,
         parameters=parse_parameters(args.param),
-        board=args.board,
         append=args.append,
         refine=args.refine,
         calibrate=args.calibrate,

@@ -31,7 +31,6 @@ def add(commands: Any) -> None:
 def run_profile(args: Namespace) -> int:
     """Run `profile`: estimate the cost of techniques in a flight, or list the boards that have a profile."""
     from edgevpr.power.boards import list_boards, load_board, resolve_board
-    from edgevpr.runtime.preflight.choose import list_preferred
     from edgevpr.runtime.preflight.estimate import estimate_flight
     from edgevpr.runtime.preflight.presentation import format_table
     from edgevpr.runtime.preflight.trial import run_trials
@@ -42,7 +41,6 @@ def run_profile(args: Namespace) -> int:
         return 0
     config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
-    list_preferred(board)  # raises if the profile lists a technique that does not exist
     plan, trials = _make_plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "running techniques")
     estimate = estimate_flight(board, results, plan)

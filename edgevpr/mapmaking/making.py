@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from edgevpr.core.config import Config, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.text import Progress, show_elapsed
+from edgevpr.core.text import Progress
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import OverlayMask, load_mask
@@ -23,7 +23,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import parse_map_path, remove_map
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.pick import make_camera_setting, pick_technique
+from edgevpr.runtime.preflight.pick import make_camera_setting
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
@@ -34,22 +34,21 @@ if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
-_ORTHOPHOTO_TECHNIQUE = "cohog"
+_DEFAULT_TECHNIQUE = "cohog"  # the most accurate on the image sets, with a confidence and without a network
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapPlan:
     """The map to make at `path` from `pictures`.
 
-    `technique`: its name (None: choose one for `board`, the board that will fly). `parameters`: technique parameters by
-    name. `append`: add places to the map if it exists. `refine`, `calibrate`: also refine and calibrate the map after
+    `technique`: its name (None: that of the existing map, or else `cohog`). `parameters`: technique parameters by name.
+    `append`: add places to the map if it exists. `refine`, `calibrate`: also refine and calibrate the map after
     its places have been made."""
 
     path: str
     pictures: FlightPictures | OrthophotoGrid
     technique: str | None = None
     parameters: dict[str, str]
-    board: str = "this"
     append: bool = False
     refine: bool = True
     calibrate: bool = True
@@ -145,19 +144,13 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
 def _open_flight(
     plan: MapPlan, pictures: FlightPictures, config: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
-    """Open the pictures and create the technique: the requested one, else that of the map (`place_map` None: there is
-    no map yet), else the best for the board. Raises UsageError if the camera looks straight down but `--camera` is
+    """Open the pictures and create the technique. Raises UsageError if the camera looks straight down but `--camera` is
     missing, or if a camera that should look straight down is tilted and its angles are not recorded."""
     source, settings, camera = pictures.open(), plan.parameters, config.camera
-    name = plan.technique or (place_map.spec.name if place_map is not None else None)
-    needs_camera_check = camera is None and place_map is None and "camera" not in settings
-    if needs_camera_check and (not name or make_camera_setting(name, "nadir")):
+    name = _choose_name(plan, place_map)
+    if camera is None and place_map is None and "camera" not in settings and make_camera_setting(name, "nadir"):
         advice.require_forward_camera(pictures, mask)
-    if name is None:
-        with show_elapsed("choosing a technique"):
-            name = pick_technique(plan.board, source.total or 1, camera)
-        settings = settings | make_camera_setting(name, camera)
-    elif camera:  # a technique without this setting rejects it
+    if camera:  # a technique without this setting rejects it
         settings = settings | {"camera": camera}
     technique = _make_technique(plan, place_map, name, settings)
     if technique.spec.looks_down and not config.gimbal and read_mount(config) == STRAIGHT_DOWN:
@@ -168,13 +161,17 @@ def _open_flight(
 def _open_orthophoto(
     plan: MapPlan, pictures: OrthophotoGrid, camera: str | None, place_map: PlaceMap | None
 ) -> tuple["OrthophotoSource", Technique]:
-    """Open the orthophoto and create the technique: the requested one, else that of the map (`place_map` None: there is
-    no map yet), else `cohog`. Raises UsageError for a camera other than nadir."""
+    """Open the orthophoto and create the technique. Raises UsageError for a camera other than nadir."""
     if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto is seen from above, so pass --camera nadir, or omit it.")
-    name = plan.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
+    name = _choose_name(plan, place_map)
     settings = plan.parameters | make_camera_setting(name, "nadir")
     return pictures.open(), _make_technique(plan, place_map, name, settings)
+
+
+def _choose_name(plan: MapPlan, place_map: PlaceMap | None) -> str:
+    """Return the technique: the requested one, else that of the map (None: there is no map yet), else the default."""
+    return plan.technique or (_DEFAULT_TECHNIQUE if place_map is None else place_map.spec.name)
 
 
 def _make_technique(plan: MapPlan, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:

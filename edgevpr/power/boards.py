@@ -44,7 +44,6 @@ class Board:
     `rate_hz`: queries per second unless the user sets a rate.
     `cpu_share` (of all cores), `budget_mb` (map index), `memory_max_mb` (whole process): limits of what edgevpr uses.
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
-    `technique`: default technique, if it fits the budget (None: the best that fits).
     `threads`: number of threads that a network may use.
     `recognised_by`: text in the model name (device tree or firmware) of a machine that is this board (None:
     never).
@@ -65,7 +64,6 @@ class Board:
     memory_max_mb: float = bounded_key(1, 4_000_000)
     thermal_limit_c: float | None = bounded_key(30, 125)
     benchmark_score: MachineSpeed
-    technique: str | None = None
     threads: int = bounded_key(1, 64, default=1)
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:

@@ -28,9 +28,6 @@ _FACTORIES = {
     "region_vlad": "network:region_vlad",
     "cross_region_bow": "regions:cross_region_bow",
 }
-# The default is the first of these that fits the board. Networks are never the default: they need onnxruntime in RAM,
-# and weights that the user has chosen. Nor is `seqslam`: a sequence needs a flight along the mapped route.
-DEFAULT_TECHNIQUES = ("cohog", "hog")
 CONFIDENCE_TECHNIQUE = "cohog"  # the only technique whose matches have a confidence
 _TYPE_NAMES = {int: "an integer", float: "a number", str: "text"}
 

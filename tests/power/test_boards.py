@@ -37,7 +37,6 @@ def test_load_board_gives_a_complete_profile_with_its_sources(name):
     assert board.source
     assert board.benchmark_score.source
     assert board.benchmark_score.arm64_mips or not board.benchmark_score.verified
-    assert board.technique == "cohog"
     assert 1 <= board.threads <= max(1, round(board.cores * board.cpu_share)), "as many as cores are spared"
 
 

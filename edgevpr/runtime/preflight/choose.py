@@ -3,8 +3,8 @@
 The accuracy of each technique, for a downward or forward camera, was measured on image sets by `make results`. These
 figures (accuracy.json) are installed with the program, so that every cost can be shown with its accuracy.
 
-An option is a technique in one form. The most accurate option that fits the board is chosen. A technique that accepted
-a wrong place on the image sets is never chosen automatically, because its fixes would be sent.
+An option is a technique in one form. The most accurate option that fits the board is recommended. A technique that
+accepted a wrong place on the image sets is never recommended, because its fixes would be sent.
 """
 
 import json
@@ -16,8 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from edgevpr import techniques
-from edgevpr.core.errors import ConfigError
 from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
@@ -96,7 +94,7 @@ class Option:
 
     @property
     def objection(self) -> str | None:
-        """Reason not to choose the option automatically, to follow its label; None if there is none."""
+        """Reason not to recommend the option, to follow its label; None if there is none."""
         if self.misfit:
             return self.misfit
         if self.accuracy is None:
@@ -163,52 +161,18 @@ def list_fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
     return tuple(sorted((int(match[1]) for match in measured_labels if match), reverse=True))
 
 
-def choose_best(options: Sequence[Option], board: Board) -> Option | None:
+def choose_best(options: Sequence[Option]) -> Option | None:
     """Choose the most accurate option without an objection; of equally accurate ones, that with the least CPU time.
-    Options of the technique in the board's profile (`board.technique`) take precedence, even if none of them
-    was measured. Returns None if no option is suitable."""
-    suitable = [option for option in options if option.objection is None]
-    preferred = [option for option in suitable if option.name == board.technique]
-    unmeasured = (option for option in options if not (option.accuracy or option.misfit))
-    if not preferred and (default := next((option for option in unmeasured if option.name == board.technique), None)):
-        return default
-    return max(preferred or suitable, key=lambda option: (_get_recall(option), -option.cpu_s), default=None)
+    Returns None if no option is suitable."""
+    suitable = [(option.accuracy, option) for option in options if option.accuracy and option.objection is None]
+    suitable.sort(key=lambda pair: (-pair[0].recall_at_1, pair[1].cpu_s))
+    return suitable[0][1] if suitable else None
 
 
 def explain_no_choice(options: Sequence[Option], board: Board) -> str:
     """Return a sentence that explains why `choose_best` returned None."""
     objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
     return f"no technique suits {board.title}: {', and '.join(objections)}"
-
-
-def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
-    """Return the techniques to try if none is configured, best first: the one in the board's profile, then the
-    defaults. For a downward camera ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
-    if the technique in the board's profile is unknown.
-    """
-    preferred = board.technique
-    if preferred is not None and not techniques.is_known(preferred):
-        raise ConfigError(
-            f"The technique `{preferred}` in the profile of {board.title} is unknown: use one of "
-            f"{', '.join(techniques.list_techniques())}."
-        )
-    names = dict.fromkeys((preferred, *techniques.DEFAULT_TECHNIQUES) if preferred else techniques.DEFAULT_TECHNIQUES)
-    return tuple(name for name in names if camera != "nadir" or "camera" in techniques.read_parameters(name))
-
-
-def describe_option(board: Board, option: Option, demand: Demand) -> str:
-    """Return the accuracy of an option, its cost and, if it does not fit, the reason."""
-    figures = (
-        f"{option.accuracy or 'never measured'}; {demand} need {option.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, "
-        f"the process {option.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and "
-        f"{_round_down(option.reachable_hz):g} Hz with {board.cores * board.cpu_share:.2g} of {board.cores} cores "
-        f"({demand.rate_hz:g} Hz needed)"
-    )
-    return f"{figures}; it {option.misfit}" if option.misfit else figures
-
-
-def _get_recall(option: Option) -> float:
-    return option.accuracy.recall_at_1 if option.accuracy else 0.0
 
 
 @cache

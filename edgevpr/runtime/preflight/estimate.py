@@ -126,17 +126,14 @@ def _recommend(
         return None, f"None: the cost of every technique is {explain_unknown_costs(board)}."
     if not options:
         return None, "None: no technique can be used on this machine."
-    best = choose_best(options, board)
+    best = choose_best(options)
     if best is None:
         return None, f"None: {explain_no_choice(options, board)}."
     row = rows[options.index(best)]
-    reason = "it is set in the board's profile, and was never measured"
-    if best.accuracy:
-        reason = f"the most accurate that fits: {best.accuracy}"
     return best.label, (
-        f"{best.label}: {reason}; {best.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
-        f"{best.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), "
-        f"{best.cpu_s / best.t_query_s / board.cores:.0%} of the CPU during a query, and "
+        f"{best.label}: the most accurate that fits: {best.accuracy}; "
+        f"{best.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, {best.reachable_hz:.3g} Hz "
+        f"({plan.rate_hz:g} needed), {best.cpu_s / best.t_query_s / board.cores:.0%} of the CPU during a query, and "
         f"{row.flight_marginal_mah:.3g} mAh per flight in addition to the "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} mAh of the idle board."
     )

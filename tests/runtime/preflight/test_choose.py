@@ -9,21 +9,17 @@ import numpy as np
 import pytest
 from example_costs import REGIONS, VECTOR, make_accuracy
 
-from edgevpr import techniques
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.core.errors import ModelError
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import choose as choosing
-from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.choose import (
     Demand,
     choose_best,
     explain_no_choice,
     find_accuracy,
     list_fewer_candidates,
-    list_preferred,
     make_option,
 )
 from edgevpr.runtime.preflight.probe import measure_costs
@@ -49,7 +45,7 @@ def fit(board, costs, places, rate_hz=1.0):
 
 
 def choose_label(board, costs, places):
-    option = choose_best(make_options(board, costs, places), board)
+    option = choose_best(make_options(board, costs, places))
     return option and option.label
 
 
@@ -113,18 +109,15 @@ def test_choose_best_returns_the_most_accurate_that_fits(accuracies):
     assert choose_label(board(), COSTS, places=100) == "regions"
     assert choose_label(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
     assert choose_label(board(), COSTS, places=300) == "vector", "regions are too slow"
-    assert choose_label(board(technique="vector"), COSTS, 100) == "vector", "the board's own goes before a better one"
     of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
     assert choose_label(board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
     del accuracies["regions"]
     assert choose_label(board(), COSTS, 100) == "vector", "what was never measured"
-    assert choose_label(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
 
 
 def test_choose_best_never_returns_one_that_accepted_wrong_places(accuracies):
     accuracies["regions"] = make_accuracy(0.9, wrong=1)
     assert choose_label(board(), COSTS, 100) == "vector"
-    assert choose_label(board(technique="regions"), COSTS, 100) == "vector"
     accuracies["vector"] = make_accuracy(0.5, wrong=2)
     assert choose_label(board(), COSTS, 100) is None
     why = explain_no_choice(make_options(board(), COSTS, 100), board())
@@ -164,44 +157,6 @@ def test_make_option_refuses_rates_at_which_fixes_would_be_too_late():
     assert slow.t_query_s == pytest.approx(5.3)
     assert "takes 5.3 s" in slow.misfit
     assert not fit(board(), REGIONS, places=1225, rate_hz=0.1).misfit
-
-
-@pytest.mark.slow
-def test_pick_technique_skips_a_missing_network(monkeypatch, caplog, accuracies):
-    accuracies["cohog"] = make_accuracy(0.9)
-    really = pick.make_technique
-
-    def made_for(threads, name, settings=None):
-        if name == "netvlad":
-            raise ModelError("There is no model.")
-        return really(threads, name, settings)
-
-    monkeypatch.setattr(pick, "make_technique", made_for)
-    own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
-    monkeypatch.setattr(pick, "load_board", lambda name: own)
-    assert pick.pick_technique("this", 10) == "cohog"
-    assert any("netvlad" in message for message in caplog.messages)
-
-
-def test_list_preferred_begins_with_the_boards_own_technique():
-    assert list_preferred(board(technique=None)) == techniques.DEFAULT_TECHNIQUES
-    assert list_preferred(board(technique="seqslam")) == ("seqslam", *techniques.DEFAULT_TECHNIQUES)
-    assert list_preferred(board(technique="hog"), "forward") == ("hog", "cohog")
-    assert (
-        list_preferred(board(technique="hog"), "nadir") == list_preferred(board(technique=None), "nadir") == ("cohog",)
-    )
-
-
-def test_pick_technique_returns_the_best_and_logs_why_if_nothing_fits(monkeypatch, caplog):
-    slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
-    monkeypatch.setattr(pick, "measure_costs", lambda technique: slow)
-    for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
-        assert pick.pick_technique("this", 10, camera) == "cohog"
-        assert pick.make_camera_setting("cohog", camera) == knows
-        assert pick.make_camera_setting("hog", camera) == {}
-    said = [record.message for record in caplog.records if record.message.startswith("using technique")]
-    assert len(said) == 3
-    assert "takes 30.0 s" in said[0]
 
 
 def test_find_accuracy_gives_the_figures_of_the_results():

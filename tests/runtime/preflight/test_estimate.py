@@ -104,7 +104,7 @@ def test_estimate_on_the_board_itself_notes_unverified_power_alone():
 @pytest.mark.usefixtures("on_this_board")
 def test_estimate_recommends_the_most_accurate_that_fits_with_the_reason():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
-    estimated = estimate(forms, board=replace(PI, technique=None))
+    estimated = estimate(forms, board=PI)
     assert estimated.recommended == "cohog"
     assert estimated.reason.startswith("cohog: the most accurate that fits: recall@1 0.90 on 2 image sets")
     assert estimate({"netvlad": VECTOR}).recommended is None

@@ -1,10 +1,9 @@
-"""The technique picked before a flight, the measured time of a query, and the numbers of candidates that are safe."""
+"""The measured time of a query, the accuracy of a technique, and the numbers of candidates that are safe."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from example_costs import REGIONS
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError
@@ -12,7 +11,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.preflight.pick import describe_accuracy, list_safe_candidates, measure_query, pick_technique
+from edgevpr.runtime.preflight.pick import describe_accuracy, list_safe_candidates, make_camera_setting, measure_query
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 
@@ -52,17 +51,10 @@ def test_describe_accuracy_is_of_the_technique_and_form(recogniser):
     assert describe_accuracy(recogniser.technique).startswith("recall@1 ")
 
 
-@pytest.mark.parametrize(
-    ("board", "named", "chosen"),
-    [("rpi-4b", None, "cohog"), ("rpi-4b", "hog", "hog"), ("odroid-xu4", None, "cohog"), ("odroid-xu4", "hog", "hog")],
-)
-def test_pick_technique_uses_unknown_costs_only_if_requested_or_all_are_unknown(monkeypatch, board, named, chosen):
-    monkeypatch.setattr(pick, "measure_costs", lambda technique: REGIONS)
-    monkeypatch.setattr(pick, "load_board", lambda name: replace(load_board(name), technique=named))
-    monkeypatch.setattr(
-        pick.techniques, "DEFAULT_TECHNIQUES", ("hog", "cohog") if board == "rpi-4b" else ("cohog", "hog")
-    )
-    assert pick_technique(board, 100) == chosen
+def test_make_camera_setting_is_for_techniques_that_have_it():
+    for camera, setting in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
+        assert make_camera_setting("cohog", camera) == setting
+        assert make_camera_setting("hog", camera) == {}
 
 
 def test_list_safe_candidates_lists_only_counts_without_wrong_matches(recording, monkeypatch):
