@@ -7,7 +7,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.text import format_markdown_table
 from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -57,7 +56,6 @@ def made_by() -> Row:
 @cache
 def commit(repository: Path = REPOSITORY) -> str:
     """Return the commit of a repository that is measured, and whether something has changed since."""
-
     if not shutil.which("git"):
         return "unknown"
     asked = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
@@ -141,6 +139,12 @@ def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], left: i
     """Return rows as a Markdown table. A column is its heading and a template such as "{error[median_m]:.1f}"; what a
     row lacks, or has as None, is "-"."""
     return format_markdown_table(list(columns), [[cell(each, row) for each in columns.values()] for row in rows], left)
+
+
+def format_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Return a Markdown table: the first `left` columns left-aligned, the others right-aligned."""
+    ruler = ["---"] * left + ["---:"] * (len(headings) - left)
+    return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
 
 
 def cell(template: str, row: Mapping[str, Any]) -> str:

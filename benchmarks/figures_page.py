@@ -7,9 +7,7 @@ from typing import Any
 
 import base
 import sets_page
-from base import REPOSITORY, RESULTS
-
-from edgevpr.core.text import format_markdown_table
+from base import REPOSITORY, RESULTS, format_markdown_table
 
 BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
 

@@ -28,7 +28,7 @@ from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, read_prior, summarise
-from edgevpr.lab.evaluate.metrics import add_pcu
+from edgevpr.lab.evaluate.metrics import add_pcu, read_result
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import hash_model_file
@@ -186,7 +186,7 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
             "cpu": provenance.read_cpu_model(),
         }
     in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
-    for row, each in zip(in_order, add_pcu(sets_page.result(row) for row in in_order), strict=True):
+    for row, each in zip(in_order, add_pcu(read_result(row) for row in in_order), strict=True):
         row |= asdict(each)  # the slowest encoder of all may be another now
     made = base.made_by()
     content = {"set": folder.name, "use": base.use_of(folder.name), "date": made["date"], "machine": made["machine"]}
@@ -235,7 +235,7 @@ def write_accuracy(contents: list[dict[str, Any]]) -> None:
                     "queries": sum(row["queries"] for row in recalls),
                     "asked": sum(row["queries"] for row in results),
                     **{key: sum(row[key] for row in results) for key in ("accepted", "accepted_wrong")},
-                    "accepted_elsewhere": sum(sets_page.result(row).accepted_elsewhere for row in results),
+                    "accepted_elsewhere": sum(read_result(row).accepted_elsewhere for row in results),
                 }
     ACCURACY.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -6,9 +6,8 @@ from typing import Any
 
 import base
 
-from edgevpr.core.text import format_markdown_table
 from edgevpr.lab.evaluate import tables
-from edgevpr.lab.evaluate.metrics import Quality, TechniqueResult, read_result
+from edgevpr.lab.evaluate.metrics import TechniqueResult, read_result
 
 CURVES = "curves.png"
 _PANELS_A_ROW = 3
@@ -47,11 +46,6 @@ beside this page hold every figure.
 """
 
 
-def result(row: dict[str, Any]) -> TechniqueResult:
-    """Return a row of a file as what it was."""
-    return read_result(row)
-
-
 def read_sets(folder: Path) -> list[dict[str, Any]]:
     """Read the results of all image sets in a folder."""
     contents = [base.read(path.stem, folder) for path in sorted(folder.glob("*.json"))]
@@ -76,14 +70,14 @@ def is_drawn(label: str) -> bool:
 def write(folder: Path, left_out: dict[str, str]) -> None:
     """Sum up all files of `folder`; `left_out` says of sets that are not there why."""
     contents = read_sets(folder)
-    results = {content["set"]: [result(row) for row in content["techniques"].values()] for content in contents}
+    results = {content["set"]: [read_result(row) for row in content["techniques"].values()] for content in contents}
     drawn = {name: [each for each in rows if is_drawn(each.technique)] for name, rows in results.items()}
     plot(drawn, folder / CURVES)
     base.shrink(folder / CURVES)
     (folder / "sets.md").write_text(_page(contents, results, left_out))
 
 
-def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
+def plot(results: Mapping[str, Sequence[TechniqueResult]], path: Path) -> None:
     """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
     A curve is that of all queries.
     A curve of one point, where all scores are the same, is drawn as a mark."""
@@ -119,8 +113,10 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
         for label, row in content["techniques"].items()
         if not label.endswith(FORMS)
     ]
-    reached = [[name, *cells] for name, row in shown for cells in tables.make_rows(result(row), _REACHED)]
-    costs = [(name, row, *tables.make_rows(result(row), tables.COSTS, include_in_map=False)) for name, row in shown]
+    reached = [[name, *cells] for name, row in shown for cells in tables.make_rows(read_result(row), _REACHED)]
+    costs = [
+        (name, row, *tables.make_rows(read_result(row), tables.COSTS, include_in_map=False)) for name, row in shown
+    ]
     paid = [[name, *cells, row["cpu"]] for name, row, cells in costs if name in _PAID]
     old = [content["set"] for content in contents if any("unscored" not in row for row in _rows(content))]
     weights = sorted({each.weights for rows in results.values() for each in rows if each.weights})
@@ -129,7 +125,7 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
 Made by `make results` with {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}; the table of costs names
 the machine of each row. Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
-{format_markdown_table(("set", "use", "date", "commit"), made)}
+{base.format_markdown_table(("set", "use", "date", "commit"), made)}
 
 {_ABOUT}
 Weights in use:
@@ -146,7 +142,7 @@ Of the queries whose place is in the map:
 
 ## Recognition
 
-{format_markdown_table(("set", *tables.list_headings(_REACHED)), reached)}
+{base.format_markdown_table(("set", *tables.list_headings(_REACHED)), reached)}
 
 Rows are of all queries; where some have no place in the map, those called *in map* are of the others alone. Sets that
 were measured before such queries were counted: {", ".join(old) or "none"}.
@@ -161,7 +157,7 @@ were measured before such queries were counted: {", ".join(old) or "none"}.
 
 ## Costs
 
-{format_markdown_table(("set", *tables.list_headings(tables.COSTS), "machine"), paid)}
+{base.format_markdown_table(("set", *tables.list_headings(tables.COSTS), "machine"), paid)}
 
 * Means over the queries; t_m is for all references. U: share of all cores. Of the other sets the JSON files have them.
 * mAh: {contents[0]["ah_assumes"]}.
@@ -184,7 +180,7 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
         rows.append([label, " or ".join(map(str, sizes)), *recalls])
     queries = [of_matches(_rows(content)[0])["queries"] for content in contents]
     heads = [f"{each['set']} ({each['use']}, {count})" for each, count in zip(contents, queries, strict=True)]
-    return format_markdown_table(("technique", "RAM B/place", *heads), rows)
+    return base.format_markdown_table(("technique", "RAM B/place", *heads), rows)
 
 
 def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:

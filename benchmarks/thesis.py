@@ -6,16 +6,16 @@ other benchmarks. The values of the thesis stand in thesis.yaml, each with its s
 """
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
 import base
+import numpy as np
 import thesis_page
 from base import DATA, REPOSITORY, RESULTS
 from thesis_values import MATRICES, Results, measured_rows, read_results
 
-from edgevpr.lab.evaluate.dataset import read_truth
-from edgevpr.lab.evaluate.similarity import assess_quality, read_similarities
+from edgevpr.lab.evaluate.dataset import list_names, read_truth
+from edgevpr.lab.evaluate.metrics import compute_quality, rank_of_first_correct
 
 SET = "corridor"
 
@@ -32,15 +32,20 @@ def main() -> None:
 
 
 def matrices(folder: Path, images: Path) -> dict[str, dict]:
-    """Measure every stored similarity matrix of the author, as `edgevpr eval --similarity` does, and add the times that
-    he published with them."""
+    """Measure every stored similarity matrix of the author (a row per query, a column per reference), and add the
+    times that he published with them."""
     times = {row["technique"]: row for row in base.read_csv(folder / f"{SET}_figures.csv")}
-    truth = read_truth(images / "ground_truth.csv")
+    references, truth = list_names(images / "ref"), read_truth(images / "ground_truth.csv")
+    correct = np.array([[name in answers[0] for name in references] for answers in truth.values()])
     found = {}
     for path in sorted(folder.glob(f"{SET}_*.npy")):
         name = path.stem.removeprefix(f"{SET}_")
         published = {key: float(times[name][key]) for key in ("t_encode_s", "t_match_per_ref_s")}
-        found[name] = {**asdict(assess_quality(name, read_similarities(path), truth)), **published}
+        scores = np.load(path)
+        orders = np.argsort(-scores, axis=1, kind="stable")
+        ranks = np.array([rank_of_first_correct(*row) for row in zip(orders, correct, strict=True)])
+        quality = compute_quality(scores.max(axis=1), ranks, correct.any(axis=1))
+        found[name] = {"technique": name, "references": len(references), "unscored": 0, **quality, **published}
     return found
 
 

@@ -1,5 +1,6 @@
 """What techniques cost, by the thesis and here: charge, times, memory, PCU. Sections of docs/thesis.md."""
 
+from base import format_markdown_table
 from thesis_values import (
     MATRICES,
     ROWS,
@@ -14,8 +15,6 @@ from thesis_values import (
     three,
     total_ah,
 )
-
-from edgevpr.core.text import format_markdown_table
 
 FLOAT_BYTES = 4
 

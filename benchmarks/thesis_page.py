@@ -4,9 +4,8 @@ import textwrap
 
 import thesis_costs as costs
 import thesis_quality as quality
+from base import format_markdown_table
 from thesis_values import ROWS, THESIS, Results, total_ah
-
-from edgevpr.core.text import format_markdown_table
 
 
 def answers(results: Results) -> list[list[str]]:

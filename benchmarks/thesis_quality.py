@@ -1,8 +1,7 @@
 """How well techniques recognise, by the thesis and here, and memorable maps. Sections of docs/thesis.md."""
 
+from base import format_markdown_table
 from thesis_values import MATRICES, ROWS, THESIS, Results, measured_rows, sentence
-
-from edgevpr.core.text import format_markdown_table
 
 # What is different here from the author's techniques.
 SMALL = "the small network that is shipped stands in for a large one trained for places or ImageNet"
@@ -41,9 +40,9 @@ def corridor(results: Results) -> str:
     return f"""## Corridor: the author's similarity matrices
 
 The thesis's own sets are not at hand, but corridor is (table 2.1 has it), and the author published the similarity
-matrices of eight techniques on it with his later benchmark, VPR-Bench. Here both go through the same code: the matrices
-through that of `edgevpr eval --similarity`, the techniques through `edgevpr eval` (`cohog` as in the thesis, with
-`matching=thesis` and `--exact`). One query is {1 / flown["queries"]:.3f}.
+matrices of eight techniques on it with his later benchmark, VPR-Bench. Here the code of `edgevpr eval` computes the
+figures of both (`cohog` as in the thesis, with `matching=thesis` and `--exact`).
+One query is {1 / flown["queries"]:.3f}.
 
 {format_markdown_table(found_heads, found)}
 

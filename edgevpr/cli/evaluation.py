@@ -1,10 +1,9 @@
-"""`edgevpr eval`: measure techniques, or stored similarities, on data sets with ground truth.
+"""`edgevpr eval`: measure techniques on data sets with ground truth.
 
 In this module a set is a data set, and a row of the printed tables is one technique with its settings.
 """
 
 from argparse import Namespace
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +37,6 @@ def add(commands: Any) -> None:
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (default: see --within-m)")
     text = "references within this distance of a query, in metres, are correct (default: 25)"
     parser.add_argument("--within-m", type=parse_positive, default=25.0, metavar="M", help=text)
-    parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
     text = f"vector formats to evaluate: {', '.join(FORMS)} (default: float)"
     parser.add_argument("--form", default="float", metavar="A,B", help=text)
     parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
@@ -54,9 +52,7 @@ def add(commands: Any) -> None:
 
 
 def run_eval(args: Namespace) -> int:
-    """Run `eval`: measure stored similarities, or techniques on data sets, and print the results."""
-    if args.similarity:
-        return _measure_similarities(args)
+    """Run `eval`: measure techniques on data sets, and print the results."""
     from edgevpr.lab.evaluate.evaluate import MatchOptions
     from edgevpr.lab.evaluate.runs import measure
     from edgevpr.lab.evaluate.tables import format_results
@@ -83,30 +79,12 @@ def run_eval(args: Namespace) -> int:
     return 1 if outcome.failed else 0
 
 
-def _measure_similarities(args: Namespace) -> int:
-    from edgevpr.lab.evaluate.dataset import list_names, read_truth
-    from edgevpr.lab.evaluate.provenance import describe_origin
-    from edgevpr.lab.evaluate.similarity import add_unscored, assess_quality, read_similarities
-    from edgevpr.lab.evaluate.tables import format_results
-
-    if not args.ground_truth:
-        raise UsageError("--similarity also needs --ground-truth, the ground truth of the stored similarities.")
-    truth = read_truth(args.ground_truth)
-    if args.query:
-        truth = add_unscored(truth, list_names(args.query))
-    references = list_names(args.ref) if args.ref else None
-    results = [assess_quality(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
-    qualities = {result.technique: asdict(result) for result in results}
-    print_result({**describe_origin(), "similarities": qualities}, args.json, format_results(results))
-    return 0
-
-
 def _open_sets(args: Namespace) -> "dict[str, Dataset]":
     """Open the data sets given by the flags."""
     from edgevpr.lab.evaluate.dataset import load_dataset, match_positions, open_folder
 
     if not (args.data or (args.query and args.ref)):
-        raise UsageError("Pass data sets with --data, or with --query and --ref, or similarities with --similarity.")
+        raise UsageError("Pass data sets with --data, or with --query and --ref.")
     if args.data and args.ground_truth:
         raise UsageError("--ground-truth applies only to --query and --ref: a folder of --data has its own.")
     sets = {}

@@ -78,12 +78,6 @@ def align_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     return ["  ".join(line).rstrip() for line in lines]
 
 
-def format_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """Return a Markdown table: the first `left` columns left-aligned, the others right-aligned."""
-    ruler = ["---"] * left + ["---:"] * (len(headings) - left)
-    return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
-
-
 def wrap_sentence(text: str) -> list[str]:
     """Break a sentence into lines of at most 120 columns, between words only."""
     return textwrap.wrap(text, _LINE_COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)

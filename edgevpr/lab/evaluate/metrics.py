@@ -47,22 +47,12 @@ class Figures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Quality(Figures):
-    """Quality of a technique on a data set: the figures of all scored queries.
+class TechniqueResult(Figures):
+    """Result of a technique (in one form) on a data set: the figures of all scored queries, its weights and its cost.
 
-    `queries_off_map` of them have no place in the map, so all their matches are wrong. `with_match` are the figures
-    of the others alone (None: these are all queries, or there are none). `unscored` queries have no ground truth."""
-
-    technique: str
-    references: int
-    queries_off_map: int = 0
-    unscored: int = 0
-    with_match: Figures | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TechniqueResult(Quality):
-    """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
+    `queries_off_map` of the queries have no place in the map, so all their matches are wrong. `with_match` are the
+    figures of the others alone (None: these are all queries, or there are none). `unscored` queries have no ground
+    truth.
 
     `accepted`, `accepted_wrong`, `accepted_off_map`, `accepted_elsewhere` and `discarded` count queries by the fields
     of `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for
@@ -74,6 +64,11 @@ class TechniqueResult(Quality):
     `pcu`: set by `add_pcu`, because it depends on all techniques compared.
     """
 
+    technique: str
+    references: int
+    queries_off_map: int = 0
+    unscored: int = 0
+    with_match: Figures | None = None
     parameters: dict[str, int | float | str]
     accepted: int
     accepted_wrong: int
@@ -187,8 +182,8 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
 
 
 def compute_quality(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> dict[str, Any]:
-    """Return the fields of a `Quality`, by name, that are computed from the answers: the figures of all queries, and of
-    those whose place is in the map."""
+    """Return the fields of a `TechniqueResult`, by name, that are computed from the answers: the figures of all
+    queries, and of those whose place is in the map."""
     figures = compute_figures(scores, ranks, has_match)
     is_mixed = has_match.any() and not has_match.all()
     return {

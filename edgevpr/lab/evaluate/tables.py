@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from edgevpr.core.text import align_table
-from edgevpr.lab.evaluate.metrics import Figures, Interval, Quality, TechniqueResult
+from edgevpr.lab.evaluate.metrics import Figures, Interval, TechniqueResult
 from edgevpr.lab.evaluate.provenance import read_versions
 
 Column = tuple[str, Callable[[Any], str]]  # the heading, and a function that formats the cell of a result
@@ -74,7 +74,7 @@ COSTS: tuple[Column, ...] = (
 )
 
 
-def make_rows(result: Quality, columns: Sequence[Column], include_in_map: bool = True) -> Iterator[list[str]]:
+def make_rows(result: TechniqueResult, columns: Sequence[Column], include_in_map: bool = True) -> Iterator[list[str]]:
     """Yield the row of a result. With `include_in_map`, also yield a row for the queries whose place is in the map, if
     there are others."""
     yield [result.technique, *(format_cell(result) for _, format_cell in columns)]
@@ -87,18 +87,16 @@ def list_headings(columns: Sequence[Column]) -> list[str]:
     return ["technique", *(heading for heading, _ in columns)]
 
 
-def format_results(results: Sequence[Quality]) -> str:
-    """Return the text that `edgevpr eval` prints for a data set: tables, then notes on them. Results for stored
-    similarities have no costs."""
-    has_costs = isinstance(results[0], TechniqueResult)
+def format_results(results: Sequence[TechniqueResult]) -> str:
+    """Return the text that `edgevpr eval` prints for a data set: tables, then notes on them."""
     texts = []
-    for columns in (RECALLS, (*CURVE, *DECISIONS), COSTS) if has_costs else (RECALLS, CURVE):
+    for columns in (RECALLS, (*CURVE, *DECISIONS), COSTS):
         rows = [row for result in results for row in make_rows(result, columns, include_in_map=columns is not COSTS)]
         texts.append("\n".join(align_table([list_headings(columns), *rows])) + "\n")
-    return "\n".join([*texts, *list_notes(results)])
+    return "\n".join([*texts, *_list_notes(results)])
 
 
-def list_notes(results: Sequence[Quality]) -> Iterator[str]:
+def _list_notes(results: Sequence[TechniqueResult]) -> Iterator[str]:
     """Yield the sentences below the tables of a data set."""
     first = results[0]
     yield f"{first.queries} queries scored against {first.references} references."
@@ -106,14 +104,6 @@ def list_notes(results: Sequence[Quality]) -> Iterator[str]:
     if first.unscored:
         yield f"{first.unscored} more queries have no ground truth and are not scored."
     yield from ABOUT_FIGURES
-    techniques = [result for result in results if isinstance(result, TechniqueResult)]
-    if techniques:
-        yield from _list_notes_on_techniques(techniques)
-    versions = (f"{name} {version or '(not installed)'}" for name, version in read_versions().items())
-    yield f"Computed with {', '.join(versions)}."
-
-
-def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[str]:
     for result in results:
         if result.sequence > 1:
             yield f"{result.technique} matched sequences of {result.sequence} queries."
@@ -128,3 +118,5 @@ def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[st
     yield f"mAh: {results[0].ah_assumes}."
     for weights in dict.fromkeys(result.weights for result in results if result.weights):
         yield f"Weights of {weights}."
+    versions = (f"{name} {version or '(not installed)'}" for name, version in read_versions().items())
+    yield f"Computed with {', '.join(versions)}."

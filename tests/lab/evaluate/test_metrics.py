@@ -1,6 +1,10 @@
 """The figures of quality: small cases worked out by hand, and any scores at all by scikit-learn."""
 
+import csv
 import math
+import os
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +14,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.metrics import compute_figures, compute_quality, wilson_interval
+from edgevpr.lab.evaluate.dataset import list_names, read_truth
+from edgevpr.lab.evaluate.metrics import compute_figures, compute_quality, rank_of_first_correct, wilson_interval
 
+DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[4] / "shared" / "data")
+PUBLISHED = DATA / "vprbench_precomputed"
 NEVER = math.inf
 
 
@@ -19,8 +26,7 @@ def compute_figures_of(*queries):
     """The figures of queries (score, rank of the first right reference), whose place is in the map unless they have a
     third value, False."""
     scores, ranks, has_match = zip(*((*query, True)[:3] for query in queries), strict=True)
-    both = compute_quality(np.array(scores), np.array(ranks), np.array(has_match))
-    return metrics.Quality(technique="", references=10, **both)
+    return SimpleNamespace(**compute_quality(np.array(scores), np.array(ranks), np.array(has_match)))
 
 
 def test_compute_quality_of_a_perfect_run_with_ties():
@@ -113,3 +119,28 @@ def test_compute_figures_equal_those_of_scikit_learn(queries):
     assert found.recall_at_100_precision_vpr_tutorial == pytest.approx(certain)
     if not right.all():
         assert found.roc_auc == pytest.approx(sklearn.metrics.roc_auc_score(right, scores), abs=1e-12)
+
+
+@pytest.mark.data
+def test_compute_figures_gives_the_published_figures_of_eight_matrices():
+    if not PUBLISHED.is_dir():
+        pytest.skip("the published matrices are not here")
+    references, truth = list_names(DATA / "corridor" / "ref"), read_truth(DATA / "corridor" / "ground_truth.csv")
+    correct = np.array([[name in answers[0] for name in references] for answers in truth.values()])
+    with open(PUBLISHED / "corridor_figures.csv") as handle:
+        published = {row.pop("technique"): row for row in csv.DictReader(handle)}
+    assert len(published) == 8
+    ours = {"auc_eq_2_3": "auc_2_3", "auc_scikit_learn": "auc_from_zero"}
+    for name, row in published.items():
+        scores = np.load(PUBLISHED / f"corridor_{name}.npy")
+        ranks = [
+            rank_of_first_correct(np.argsort(-row, kind="stable"), is_correct)
+            for row, is_correct in zip(scores, correct, strict=True)
+        ]
+        found = compute_figures(scores.max(axis=1), np.array(ranks), correct.any(axis=1))
+        for figure, value in row.items():
+            if not figure.startswith("t_"):
+                assert getattr(found, ours.get(figure, figure)) == pytest.approx(float(value), abs=5e-4)
+        if name == "CALC":
+            assert found.recall_at_100_precision_vpr_bench == pytest.approx(8 / 36)
+            assert found.recall_at_100_precision_vpr_tutorial == pytest.approx(8 / 111)
