@@ -38,7 +38,7 @@ def test_match_uses_one_map_in_all_forms(capsys, flight):
         assert [each["place"]["image"] for each in found] == [each["query"] for each in found]
     assert path.read_bytes() == content
     assert main(["match", str(path), "--images", str(flight / "query")]) == 0
-    assert "Weights of tiny" in capsys.readouterr().out
+    assert "A tiny network" in capsys.readouterr().out
 
 
 def test_open_recogniser_uses_the_form_of_the_configuration(flight):

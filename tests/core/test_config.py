@@ -25,7 +25,7 @@ def read_comments() -> dict[str, str]:
 
 
 def test_config_file_holds_the_default_of_every_key():
-    assert build(Config, read_yaml(SHIPPED), "the shipped file") == Config()
+    assert build(Config, read_yaml(SHIPPED), str(SHIPPED)) == Config()
     assert {key.name.removesuffix(".gps").removesuffix(".no_gps") for key in list_keys()} <= read_comments().keys()
 
 

@@ -11,11 +11,11 @@ from edgevpr.core.text import format_probability, progress
 
 def test_progress_writes_a_line_for_every_tenth_to_a_file():
     out = io.StringIO()
-    assert list(progress(range(200), 200, "cohog: queries", out)) == list(range(200))
+    assert list(progress(range(200), 200, "cohog", out)) == list(range(200))
     lines = out.getvalue().splitlines()
     assert len(lines) == 11
-    assert lines[0] == "cohog: queries  1/200  0 %"
-    assert lines[-1] == "cohog: queries  200/200  100 %"
+    assert lines[0] == "cohog  1/200  0 %"
+    assert lines[-1] == "cohog  200/200  100 %"
 
 
 def test_progress_redraws_one_line_on_a_terminal():

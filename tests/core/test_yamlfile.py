@@ -36,7 +36,7 @@ def read_refusal(tmp_path):
 
 def test_read_yaml_names_both_lines_of_a_duplicate_key(read_refusal):
     said = read_refusal("source: {uri: a}\nmap: m.gpkg\nsource: {uri: b}\n")
-    assert "config.yaml, line 3 is not valid YAML (the key `source` is already in line 1)" in said
+    assert all(part in said for part in ("line 3", "`source`", "line 1"))
     assert "line 2" in read_refusal("source:\n  {uri: a, rate_hz: 1, uri: b}\n")
     assert "line 4" in read_refusal('match:\n  min_score: 0.5\n  form: float\n  "min_score": 0.6\n')
 
@@ -48,7 +48,7 @@ def test_read_yaml_refuses_aliases(content, read_refusal):
 
 @pytest.mark.parametrize("level", ["[", "{a: ", "- ", "? "])
 def test_read_yaml_refuses_deep_nesting(level, read_refusal):
-    assert "is not valid YAML" in read_refusal(level * (MAX_FILE_BYTES // len(level) - 1))
+    assert "valid YAML" in read_refusal(level * (MAX_FILE_BYTES // len(level) - 1))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from commands import run_json
+from commands import refused, run_json
 
 from edgevpr.cli.main import main
 from edgevpr.core.contract import Descriptor
@@ -58,7 +58,8 @@ def test_move_map_moves_each_position_by_the_last_survey_of_the_flight(path, cap
     log = write_flight_log(path, RESULT | {"off_m": [99.0, 0.0]}, RESULT)
     before = read_places(path)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
-    assert "3 places moved 3.0 m west and 4.0 m north, +-0.4 m" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert all(figure in said for figure in ("3 places", "3.0 m west", "4.0 m north", "+-0.4 m"))
     after = read_places(path)
     for one, other in zip(before[:2], after[:2], strict=True):
         step = offset_m(one.position.lat_deg, one.position.lon_deg, other.position.lat_deg, other.position.lon_deg)
@@ -82,15 +83,14 @@ def test_move_map_corrects_the_scale_around_the_middle_of_the_flight(path, capsy
 def test_move_map_applies_a_log_only_once(path):
     log = write_flight_log(path, RESULT)
     assert main(["map", "move", str(path), "--by", str(log)]) == 0
-    with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match="changed or moved"):
+    with PlaceMap.open_for_writing(path) as place_map, pytest.raises(UsageError, match=path.name):
         move_map(place_map, log)
 
 
 @pytest.mark.parametrize("lines", [(), (SURVEY | RESULT | {"off_m": None, "off_sd": None},), (RESULT, SURVEY)])
 def test_move_map_moves_nothing_without_a_survey(path, lines, capsys):
     log, before = write_flight_log(path, *lines), read_places(path)
-    assert main(["map", "move", str(path), "--by", str(log)]) != 0
-    assert "no measured map offset" in capsys.readouterr().err
+    assert "map offset" in refused(capsys, "map", "move", path, "--by", log)
     assert read_places(path) == before
 
 

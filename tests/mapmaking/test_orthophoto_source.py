@@ -119,9 +119,7 @@ def test_make_lattice_refuses_an_invalid_grid(tmp_path, footprint_m, spacing_m, 
 def test_make_lattice_refuses_an_area_elsewhere_with_both_extents(tmp_path):
     orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
     for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
-        with pytest.raises(
-            UsageError, match=r"does not overlap .* north, .* east, the orthophoto over 49\.99.* east\.$"
-        ):
+        with pytest.raises(UsageError, match=r"\d north, .*\d east, .* 49\.99.* east\.$"):
             make_lattice(orthophoto, 40.0, 10.0, Area(path=(way,)))
     for off_m in (15.5, 4.0):  # between places, and so near to a row that its box holds one of either
         with pytest.raises(UsageError, match="10 m"):

@@ -128,8 +128,7 @@ def test_refine_restarts_from_the_recorded_positions(map_path, capsys):
     main(["map", "refine", str(map_path)])
     assert positions() == first
     said = capsys.readouterr().out
-    assert "28 of 28 places refined" in said
-    assert "place 10 (009.jpg): recorded 2" in said
+    assert said.count("28 of 28") == said.count("place 10 (009.jpg)") == 2
 
 
 def copy_some_places(unrefined_map, path, numbers, position=lambda number, place: place.position):

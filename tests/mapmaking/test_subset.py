@@ -87,7 +87,7 @@ def test_make_subset_within_a_budget_keeps_the_places_with_the_smallest_gaps(map
     found = make_subset(maps, area, 1000.0, tmp_path / "f.gpkg", whole.file_bytes / 2, iterate_silently)
     assert (found.near, found.places) == (25, 12)
     assert found.file_bytes < whole.file_bytes
-    with pytest.raises(UsageError, match="too small for even one place"):
+    with pytest.raises(UsageError, match=r"--mb 0\.0001 "):
         make_subset(maps, area, 1000.0, tmp_path / "g.gpkg", 100, iterate_silently)
     assert not (tmp_path / "g.gpkg").exists()
 
@@ -101,15 +101,15 @@ def test_map_subset_of_several_calibrated_maps_reports_that_it_is_not_calibrated
     one, several = tmp_path / "tiles" / "0.gpkg", tmp_path / "tiles"
     for source, lost, kept in ((one, False, "of this map"), (several, True, None)):
         assert main(["map", "subset", str(source), "--mission", f"{lat_deg},{lon_deg},1000", "--out", str(out)]) == 0
-        assert (f"edgevpr map calibrate {out}" in capsys.readouterr().out) == lost
+        assert (f"map calibrate {out}" in capsys.readouterr().out) == lost
         with PlaceMap.open(out) as place_map:
             assert place_map.calibration == kept
         out.unlink()
 
 
 def test_make_subset_refuses_invalid_requests_and_leaves_no_file(maps, tmp_path):
-    with pytest.raises(UsageError, match=r"No place of .* is within 50 m of the mission"):
+    with pytest.raises(UsageError, match=" 50 m "):
         make_subset(maps, make_path((5000, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
-    with pytest.raises(MapError, match="contains no map"):
+    with pytest.raises(MapError, match=r"\*\.gpkg"):
         make_subset(tmp_path, make_path((0, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert not list(tmp_path.iterdir())

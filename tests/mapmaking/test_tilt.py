@@ -52,7 +52,7 @@ def test_require_level_refuses_a_tilted_camera_whose_angles_are_not_recorded(gro
     for number, image in enumerate(fly(ground, 45)):
         cv2.imwrite(str(tmp_path / f"{number:02}.png"), image)
     pictures = FlightPictures(source=str(tmp_path))
-    with pytest.raises(UsageError, match="degrees or more from straight down"):
+    with pytest.raises(UsageError, match=r" \d\d degrees .*--fov-deg"):
         require_level_camera(pictures, None)
     (tmp_path / "positions.csv").write_text("file,lat,lon,roll_deg,pitch_deg\n00.png,50,8,0,45\n")
     require_level_camera(pictures, None)

@@ -33,10 +33,10 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
     (broken / "ref" / "r1.png").write_bytes(b"")
     assert run("eval", "--data", broken, make_set(tmp_path / "meadow"), *HOG, "--json") == 1
     said = capsys.readouterr()
-    assert "hog was not evaluated on broken" in said.err
+    assert "r1.png" in said.err
     content = json.loads(said.out)
     assert [row["set"] for row in content["results"]] == ["meadow"]
-    assert [row["set"] for row in content["failed"]] == ["broken"]
+    assert [(row["set"], row["row"]) for row in content["failed"]] == [("broken", "hog")]
     assert "r1.png" in refused(capsys, "eval", "--data", broken, *HOG, code=1), "nothing was measured"
 
 
