@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgevpr.core.config import load_config
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.channel import Channel
@@ -250,6 +251,11 @@ class FakeLink:
             sending.settle(True)
             self._waiting.handle(self.answer, Readiness(has_gps=True).explain(self.answer), self._clock())
             self._acks[self.answer] += 1
+
+
+def format_note(code: ReasonCode, **parameters: float) -> str:
+    """Return the text with which a reason is announced to the ground station."""
+    return f"edgevpr: {Reason(code, parameters)}"
 
 
 def receiver_at(at_deg: tuple[float, float], sd_m: float, t_s: float, **other) -> Receiver:

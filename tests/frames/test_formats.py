@@ -233,7 +233,7 @@ def test_stereo_check_refuses_side_by_side_images(join, shift_px):
     check = StereoCheck()
     for step in range(12):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
-        with pytest.raises(ImageError, match=r"halves of the picture show the same scene.*videocrop"):
+        with pytest.raises(ImageError, match=r"halves .*videocrop"):
             check.require_single(join(stereo_pair(scene, shift_px)))
     for _ in range(10):
         with contextlib.suppress(ImageError):
@@ -261,4 +261,4 @@ def test_folder_of_stereo_pictures_gives_no_frame(tmp_path):
         cv2.imwrite(str(tmp_path / f"{step}.png"), np.hstack(stereo_pair(scene, 4)))
     problems = []
     assert not any(read_to_end(open_source(str(tmp_path), live=False), problems.append))
-    assert ["left and right halves" in str(problem) for problem in problems] == [True] * 3
+    assert [isinstance(problem, ImageError) and "left and right" in str(problem) for problem in problems] == [True] * 3

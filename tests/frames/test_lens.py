@@ -127,7 +127,7 @@ def test_read_lens_refuses_files_that_are_not_calibrations(tmp_path, text, given
     with pytest.raises(ConfigError, match=says) as error:
         read_lens(path)
     assert str(error.value).startswith(path)
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match=r"absent\.yaml"):
         read_lens(str(tmp_path / "absent.yaml"))
 
 
@@ -236,5 +236,5 @@ def test_frames_of_another_size_are_scaled_and_of_another_shape_refused(ground):
     half = undistort_frame(small, None, UNKNOWN_VIEW, lens).image
     full = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens).image
     assert difference(half, cv2.resize(full, half.shape[1::-1], interpolation=cv2.INTER_AREA)) < 1
-    with pytest.raises(ImageError, match=r"640x360 pixels, but lens\.yaml was calibrated with 640x480"):
+    with pytest.raises(ImageError, match=r"640x360 .*lens\.yaml .* 640x480"):
         undistort_frame(frame.image[60:420], None, UNKNOWN_VIEW, lens)

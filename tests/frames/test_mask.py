@@ -32,7 +32,7 @@ def test_mask_is_known_by_its_pixels(tmp_path):
 
 @pytest.mark.parametrize("share", [0.61, 1.0])
 def test_load_mask_refuses_a_mask_that_covers_too_much(tmp_path, share):
-    with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, but at most 60% is allowed"):
+    with pytest.raises(UsageError, match=f" {share:.0%} .* 60% "):
         load_mask(write_mask(tmp_path / "m.png", make_mask(share, 100, 100)))
     assert load_mask(write_mask(tmp_path / "m.png", make_mask(0.6, 100, 100))).allowed.mean() == 0.4
 

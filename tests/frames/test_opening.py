@@ -105,12 +105,13 @@ def test_open_address_names_the_cause_without_a_camera(monkeypatch):
     closed = free_port()
     for uri in (f"rtsp://127.0.0.1:{closed}/a", f"http://127.0.0.1:{closed}/a", f"tcp://127.0.0.1:{closed}"):
         assert find_cause(uri) == "connection refused"
-    assert find_cause("udp://:99999") == "the address must contain host and port"
-    assert find_cause("rtsp://127.0.0.1:99999/a") == "invalid address: correct host and port"
-    assert find_cause("rtsp://camera.invalid/a") == "no such host camera.invalid"
+    for uri in ("udp://:99999", "rtsp://127.0.0.1:99999/a"):
+        assert {"host", "port"} <= set(find_cause(uri).split())
+    assert "camera.invalid" in find_cause("rtsp://camera.invalid/a")
     assert find_cause("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode special")
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.3)
-    assert find_cause(f"udp://:{closed}") == f"no packet at UDP port {closed} within 0.3 s"
+    cause = find_cause(f"udp://:{closed}")
+    assert (f"UDP port {closed} " in cause, "0.3 s" in cause) == (True, True)
 
 
 @pytest.mark.parametrize("password", ["sec/ret", "sec#ret", "sec?ret", "sec ret"])
@@ -177,10 +178,12 @@ def test_open_address_names_ports_in_use(start_sending):
     port = start_sending(send_rtp)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", port + 1))
-        assert find_cause(f"udp://:{port}") == f"UDP port {port + 1} is in use by another program"
+        cause = find_cause(f"udp://:{port}")
+        assert (f"UDP port {port + 1} " in cause, "in use" in cause) == (True, True)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", port))
-        assert find_cause(f"udp://:{port}") == f"UDP port {port} is in use by another program"
+        cause = find_cause(f"udp://:{port}")
+        assert (f"UDP port {port} " in cause, "in use" in cause) == (True, True)
 
 
 def send_unknown(port, is_on):
@@ -192,7 +195,7 @@ def send_unknown(port, is_on):
 
 def test_rtp_of_an_unknown_codec_asks_for_a_description(start_sending):
     cause = find_cause(f"udp://:{start_sending(send_unknown)}")
-    assert cause == "RTP with an unknown codec (payload type 98): describe it in an .sdp file"
+    assert ("98" in cause, ".sdp" in cause) == (True, True)
 
 
 @pytest.mark.parametrize("has_length", [True, False])
@@ -288,6 +291,6 @@ def test_check_frame_has_the_facts_of_the_first_picture_and_refuses_an_old_one(s
     uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
     code, found = check_source(uri)
     assert (code, found["width"], found["height"]) == (FindingCode.FRAME_RECEIVED, WIDTH, HEIGHT)
-    assert found["facts"] == "mjpeg, 8 bits per channel, square pixels"
+    assert [fact.split()[0] for fact in found["facts"].split(", ")] == ["mjpeg", "8", "square"]
     monkeypatch.setattr(camera, "MAX_FIX_AGE_S", -1.0)
     assert check_source(uri)[0] is FindingCode.FRAMES_LATE

@@ -7,7 +7,7 @@ from conversing import Autopilot, RecordingListener
 
 from edgevpr.mavlink.channel import Channel, ChannelChoice
 from edgevpr.mavlink.clock import AutopilotClock
-from edgevpr.mavlink.messages import Fix, Severity, make_status_text
+from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.parameters import Decision
 from edgevpr.mavlink.wire import mavlink
 
@@ -75,7 +75,7 @@ def test_link_sends_no_timestamps_without_a_recent_time_from_the_autopilot(chann
                 stamp_s = message.param1 if channel is Channel.COMMAND else message.time_usec / 1e6
                 assert stamp_s == pytest.approx(autopilot.clock.now_s, abs=1e-3), "our own clock"
     assert sent_after_s[0] == pytest.approx(5.1, abs=0.15)
-    assert caplog.text.count("does not answer TIMESYNC") == 1
+    assert caplog.text.count("TIMESYNC") == 1
 
 
 def learn(*trips, start_s=1000.0):
@@ -152,8 +152,8 @@ def test_timestamps_of_others_in_another_time_base_are_reported_once(kind, caplo
     for _ in range(3):
         autopilot.send(make_foreign_message(kind, 1.7e9), component_id=191)
     texts = [text for _, text in autopilot.texts()]
-    assert texts == [make_status_text(Severity.WARNING, f"edgevpr: bad timestamps: 7/191 {kind}").text]
-    assert caplog.text.count("differ from the autopilot's time") == 1
+    assert [f": 7/191 {kind[:15]}" in text for text in texts] == [True], "a long name is truncated"
+    assert caplog.text.count("7/191") == 1
     px4 = Autopilot(PX4)
     px4.send(make_foreign_message(kind, 1.7e9), component_id=191)
     assert px4.texts() == [], "which converts each sender's own clock"
@@ -183,11 +183,11 @@ def test_delay_s_keeps_reports_of_a_full_link_from_being_used(is_the_way_back):
     texts = [text for _ in range(4) for text in report_late(autopilot, 1.2 if is_the_way_back else 0.0)]
     assert autopilot.vehicle.t_received_s - before.t_received_s < 2.0, "the vehicle is where it was last heard in time"
     assert autopilot.conversation.predict_vehicle(autopilot.clock.now_s).roll_deg is None
-    assert any("link saturated: reports" in text for text in texts)
+    assert any(text.endswith(" s late") for text in texts)
     autopilot.timesync_s = 0.0
     texts = [text for _ in range(12) for text in report_late(autopilot, 0.05)]
     assert autopilot.clock.now_s - autopilot.vehicle.t_received_s < 0.2
-    assert any("on time again" in text for text in texts)
+    assert "on time" in texts[-1]
 
 
 class LinkOfArduPilot:

@@ -121,7 +121,8 @@ def test_selector_reports_missing_answers_once_and_withholds_fixes():
     autopilot.answer_for(1)
     autopilot.link["is_lost"] = lambda message: True
     autopilot.answer_for(30)
-    assert [text for _, text in autopilot.sentences()] == ["edgevpr: no answer for GPS2_TYPE and 1 more"]
+    ((severity, text),) = autopilot.sentences()
+    assert (severity, "GPS2_TYPE" in text, "1 more" in text) == (Severity.WARNING, True, True)
     sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
     autopilot.answer_for(1)
     assert (sending.sent, sending.why.code) == (False, ReasonCode.PARAMETERS_UNANSWERED)
@@ -129,7 +130,7 @@ def test_selector_reports_missing_answers_once_and_withholds_fixes():
     autopilot.link = {}
     autopilot.answer_for(60, Channel.GPS_INPUT)
     autopilot.answer_for(10)
-    assert (Severity.INFO, "edgevpr: positions sent via GPS_INPUT") in autopilot.sentences()
+    assert [severity for severity, text in autopilot.sentences() if "GPS_INPUT" in text] == [Severity.INFO]
 
 
 def test_selector_stops_the_channel_while_a_parameter_is_dangerous():
@@ -142,7 +143,7 @@ def test_selector_stops_the_channel_while_a_parameter_is_dangerous():
     autopilot.sent.clear()
     autopilot.answer_for(10)
     assert "GPS_INPUT" not in {message.get_type() for message in autopilot.sent}
-    assert (Severity.WARNING, "edgevpr: nothing sent: set GPS_PRIMARY=0") in autopilot.sentences()
+    assert [level for level, text in autopilot.sentences() if "set GPS_PRIMARY=0" in text] == [Severity.WARNING]
     autopilot.set(GPS_PRIMARY=0)
     assert autopilot.conversation.channel is Channel.GPS_INPUT
 
@@ -161,7 +162,8 @@ def test_selector_reports_a_weak_parameter_once():
     autopilot = ParamPilot(PX4 | {"EKF2_GPS_CTRL": 0}, mavlink.MAV_AUTOPILOT_PX4)
     autopilot.answer_for(120)
     assert autopilot.conversation.channel is Channel.SENSOR
-    assert autopilot.sentences() == [(Severity.WARNING, "edgevpr: set EKF2_GPS_CTRL=7: see the log")]
+    ((severity, text),) = autopilot.sentences()
+    assert (severity, "EKF2_GPS_CTRL=7" in text) == (Severity.WARNING, True)
 
 
 def test_selector_uses_the_command_at_once_with_unknown_firmware():

@@ -32,7 +32,7 @@ def test_identity_keeps_the_first_autopilot_while_it_sends(caplog):
     for t_s in seconds(101, 400):
         assert not identity.admits(FOREIGN, True, t_s), "another system is never taken"
     assert identity.current == OURS
-    assert caplog.text.count("another autopilot, system 2") == 1
+    assert caplog.text.count("system 2") == 1
 
 
 def test_identity_accepts_the_same_system_elsewhere_after_thirty_seconds(caplog):
@@ -50,7 +50,7 @@ def test_identity_keeps_a_configured_system_at_any_address(caplog):
     identity = Identity(system_id=1)
     assert not any(beat(identity, Endpoint(2, HERE), *seconds(0, 99)))
     assert identity.foreign_messages == 100
-    assert caplog.text.count("fixes are sent to system 1 only") == 1
+    assert caplog.text.count("system 1 ") == 1
     assert beat(identity, Endpoint(1, HERE), 100.0) == [True]
     assert not any(beat(identity, Endpoint(2, HERE), *seconds(101, 200)))
     assert beat(identity, Endpoint(1, THERE), 129.0, 130.0) == [False, True]
@@ -72,7 +72,7 @@ def test_identity_ignores_a_second_sender_with_the_same_system_id(autopilot, cap
     assert autopilot.conversation.autopilot.acks == {}
     assert autopilot.conversation.requests.take() is None
     assert autopilot.conversation.autopilot.identity.foreign_messages == 120
-    assert caplog.text.count("another autopilot, system 7") == 1
+    assert caplog.text.count("another autopilot") == 1
 
 
 @pytest.mark.parametrize(("system_id", "sent"), [(2, None), (7, True)])

@@ -38,7 +38,7 @@ def test_train_words_makes_the_technique_usable(kind, technique, folder, own_mod
     (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
     train(folder, own_models, "--kind", kind, "--count", "8")
     said = capsys.readouterr()
-    assert "descriptors of 12 images" in said.out
+    assert " 12 images" in said.out
     assert "broken.jpg" in said.err
     made = techniques.create(technique, {"model": "mine", "words": 8})
     (picture, *_) = read_pictures([folder], "reading")

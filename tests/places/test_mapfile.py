@@ -152,7 +152,7 @@ def test_repair_map_keeps_place_ids_and_metadata(map_path, tmp_path):
         place_map.record_mask("m")
         place_map.record_lens("/camera/lens.yaml")
         place_map.record_calibration("how sure")
-        for owner in ("Survey of X", None, "City of Y", "Survey of X"):
+        for owner in ("Survey X", None, "City Y", "Survey X"):
             place_map.add_attribution(owner)
     assert shrink_map(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
     write_sql(map_path, "UPDATE places SET coarse = x'00' WHERE place_id = 2")
@@ -160,7 +160,7 @@ def test_repair_map_keeps_place_ids_and_metadata(map_path, tmp_path):
     with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:
         for each in (repaired, small):
             assert (each.mask_sha256, each.lens, each.calibration) == ("m", "lens.yaml", "how sure")
-            assert each.attribution == "Survey of X; City of Y"
+            assert each.attribution == "Survey X; City Y"
             for place in each.read_places():
                 assert place.source_image == f"{place.place_id - 1:05d}.jpg"
         assert len(repaired) == 9

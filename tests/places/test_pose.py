@@ -34,9 +34,8 @@ def test_pose_and_landmarks_are_stored_and_optional(posed_map, tmp_path):
             assert second.pose is None
             assert (each.read_landmarks(1), each.read_landmarks(2)) == (LANDMARKS, None)
             assert {found.problem for found in check_places(each)} == {None}
-            assert (
-                None not in each.db.execute("SELECT geom_crc32, coarse_crc32 FROM places WHERE place_id = 2").fetchone()
-            )
+            row = each.db.execute("SELECT geom_crc32, coarse_crc32 FROM places WHERE place_id = 2")
+            assert None not in row.fetchone()
 
 
 @pytest.mark.parametrize(

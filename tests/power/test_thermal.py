@@ -60,7 +60,7 @@ def test_thermal_watch_treats_a_falling_frequency_limit_as_throttling(tree):
     assert watch.read().throttled is False
     tree({f"{POLICY}/scaling_max_freq": "1200000\n"})
     seen = watch.read()
-    assert (seen.throttled, seen.why) == (True, "frequency limited to 1200 of 1800 MHz")
+    assert (seen.throttled, "1200 of 1800 MHz" in seen.why) == (True, True)
     tree({f"{POLICY}/scaling_max_freq": "1800000\n"})
     assert watch.read().throttled is False
 

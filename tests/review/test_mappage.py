@@ -47,8 +47,8 @@ def test_map_page_shows_places_and_their_problems(browser, folder):
     assert main(list(map(str, argv))) == 0
     data = data_of(out.read_text("utf-8"))
     alike = {step["title"]: step["texts"][-1] for step in data["steps"] if "looks like" in step["texts"][-1]}
-    assert "looks like place 13: " in alike["Place 6: 05.png"]
-    assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
+    assert "place 13: " in alike["Place 6: 05.png"]
+    assert "place 6: " in alike[f"Place 13: {TWIN}"]
     assert all("place 13: " in said for title, said in alike.items() if TWIN not in title), "they overlap with its twin"
     with open_page(browser, out) as page:
         assert page.locator("image").count() == 12
@@ -56,7 +56,8 @@ def test_map_page_shows_places_and_their_problems(browser, folder):
         for _ in range(5):
             page.keyboard.press("ArrowRight")
         alts = page.eval_on_selector_all(".now img", "all => all.map(each => each.alt)")
-        assert alts == ["place 6: 05.png", f"looks alike: place 13: {TWIN}"]
+        assert alts[0] == "place 6: 05.png"
+        assert [alt.endswith(f": place 13: {TWIN}") for alt in alts[1:]] == [True]
         assert page.locator(".spot.alike").count() == 1
         page.locator("label:has([data-group])", has_text="inconsistent GPS tag").locator("input").check()
         assert page.inner_text(".now h3") == "Place 3: 02.png"

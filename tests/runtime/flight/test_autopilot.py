@@ -31,7 +31,7 @@ def test_answer_line_precedes_the_next_query(make_flight, clock, link, statuses)
     queries, answers = select(lines, "query"), select(lines, "answer")
     assert [line["query"] for line in answers] == [line["query"] for line in queries]
     assert {(line["sent"], line["result"], line["why"]["code"]) for line in answers} == {(True, "FAILED", "GPS_IN_USE")}
-    assert "3 fixes sent, 0 accepted, 3 refused (GPS in use)" in statuses[-1]
+    assert all(figure in statuses[-1] for figure in ("3 fixes sent", "0 accepted", "3 refused (GPS in use)"))
 
 
 def test_fix_not_sent_expects_no_answer(make_flight, clock):
@@ -98,7 +98,7 @@ def test_camera_lost_is_announced_and_critical_until_it_is_back(make_flight, clo
 
     lines = make_flight().fly(source)
     assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "ACTIVE"]
-    assert link.texts() == [(4, "edgevpr: camera lost"), (6, "edgevpr: camera is back")]
+    assert [severity for severity, text in link.texts() if "camera" in text] == [4, 6]
     assert [line["condition"] for line in select(lines, "source")] == ["LOST", "RUNNING"]
 
 
@@ -106,7 +106,7 @@ def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, capl
     link.send_fix = lambda fix: 1 / 0
     lines = make_flight().fly(FakeSource(pictures(2), clock))
     assert len(select(lines, "query")) == 2
-    assert sum("could not be sent to the autopilot" in record.message for record in caplog.records) == 2
+    assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ZeroDivisionError] * 2
 
 
 def test_blank_images_are_reported_once_after_ten_and_so_is_the_ground_again(make_flight, clock, link):

@@ -1,9 +1,10 @@
 """A flight that is commanded from the ground: it pauses and goes on."""
 
 import pytest
-from fakes import FakeSource
+from fakes import FakeSource, format_note
 from flights import pictures, select
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.ground import UserCommand
 from edgevpr.runtime.flight import systemd
 
@@ -30,7 +31,8 @@ def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_
         ("PAUSE", "255/190", "PAUSED_BY_COMMAND"),
         ("RESUME", "255/190", "RESUMED_BY_COMMAND"),
     ]
-    assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: resumed by command")]
+    codes = ReasonCode.PAUSED_BY_COMMAND, ReasonCode.RESUMED_BY_COMMAND
+    assert link.texts() == [(6, format_note(code)) for code in codes]
 
 
 def test_pause_halts_a_recording(make_flight, clock, link):

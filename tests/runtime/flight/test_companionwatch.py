@@ -4,7 +4,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from fakes import FakeSource
+from fakes import FakeSource, format_note
 from flights import flight_meter, select
 from pictures import textured
 
@@ -36,8 +36,8 @@ def watch_states(notifier, link):
 
 def test_companion_watch_reports_a_problem_at_its_start_and_end(watch_states):
     assert watch_states([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
-        (5, Severity.WARNING, "edgevpr: companion under-voltage: check 5 V supply"),
-        (134, Severity.INFO, "edgevpr: companion supply is back to normal"),
+        (5, Severity.WARNING, format_note(ReasonCode.UNDER_VOLTAGE)),
+        (134, Severity.INFO, format_note(ReasonCode.SUPPLY_FINE)),
     ]
 
 
@@ -72,7 +72,7 @@ def test_companion_watch_reports_under_voltage_everywhere(make_flight, clock, li
     assert {code for code, _ in notes[2:]} == {"SUPPLY_FINE", "FULL_SPEED"}
     texts = link.texts()
     assert (4, f"edgevpr: {begun}") in texts
-    assert (6, "edgevpr: companion supply is back to normal") in texts
+    assert (6, format_note(ReasonCode.SUPPLY_FINE)) in texts
     assert [record.levelname for record in caplog.records if record.message == begun] == ["WARNING"]
     assert statuses[2]["under_voltage"] is False
     assert (statuses[3]["under_voltage"], statuses[3]["throttled"]) == (True, True)

@@ -39,10 +39,7 @@ def test_gate_fix_logs_and_announces_a_held_fix_once_in_flight(recording, tmp_pa
     assert queries[0]["fix"]["why"]["code"] == "HELD_OFF_PATH"
     assert queries[0]["fix"]["why"]["parameters"]["distance_m"] == pytest.approx(3574.0, abs=0.5)
     assert link.stats().fixes_sent == 2
-    assert link.texts() == [
-        (4, "edgevpr: fix held back, contradicts autopilot"),
-        (6, "edgevpr: fixes agree again"),
-    ]
+    assert [severity for severity, text in link.texts() if "fix" in text] == [4, 6]
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
 
 

@@ -9,11 +9,12 @@ import sqlite3
 from functools import partial
 
 import pytest
-from fakes import FakeSource
+from fakes import FakeSource, format_note
 from flights import PLACES, STEP_DEG, Flight, fly_acts, noop, select
 from map_writer import write_sql
 from pictures import textured
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_FAILURES_IN_A_ROW
 
@@ -44,10 +45,8 @@ def test_damaged_fine_part_costs_one_query_and_then_only_queries_that_may_show_i
             assert place == shown or line["reason"]["code"] == "PLACE_UNREAD"
     assert sum(line["accepted"] for line in queries[2:]) >= 4, "the flight goes on with the rest"
     assert flight.end["unusable"] == 1
-    assert [(line["place"], line["problem"]) for line in select(lines, "left out")] == [
-        (place, "its fine part has the wrong size")
-    ]
-    assert flight.link.texts() == [(4, "edgevpr: map damaged, 1 place left out")]
+    assert [(line["place"], "fine part" in line["problem"]) for line in select(lines, "left out")] == [(place, True)]
+    assert [(severity, " 1 place " in text) for severity, text in flight.link.texts()] == [(4, True)]
     assert flight.end["left_out"] == queries[-1]["totals"]["left_out"] == 1
 
 
@@ -94,10 +93,10 @@ def test_failures_are_critical_and_reported_once_after_ten_until_recovery(place_
     assert health[0] is health[-1] is Health.ACTIVE
     assert [line["note"]["code"] for line in select(lines, "failing")] == ["FRAMES_FAILING", "FRAMES_RECOVERED"]
     assert link.texts() == [
-        (4, "edgevpr: map cannot be read, see the log"),
-        (4, "edgevpr: 10 frames in a row have failed"),
-        (6, "edgevpr: map can be read again"),
-        (6, "edgevpr: frames are being processed again"),
+        (4, format_note(ReasonCode.MAP_LOST)),
+        (4, format_note(ReasonCode.FRAMES_FAILING, frames=MAX_FAILURES_IN_A_ROW)),
+        (6, format_note(ReasonCode.MAP_BACK)),
+        (6, format_note(ReasonCode.FRAMES_RECOVERED)),
     ]
     assert flight.end["unusable"] == MAX_FAILURES_IN_A_ROW + 1
     assert flight.end["left_out"] == 0, "where all are damaged the file is at fault, and may come back"

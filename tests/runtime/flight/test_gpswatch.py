@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 from air import HOME, make_match
-from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
+from fakes import FakeClock, FakeLink, format_note, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -129,8 +129,8 @@ def test_gps_watch_trusts_gps_over_a_map_that_never_agreed(agreeing, trusts_gps)
 def test_gps_watch_reports_again_once_the_distance_has_doubled():
     watched = GpsHover()
     watched.matches(100.0, 100.0, 100.0, 199.0, 201.0, 202.0, *[0.0] * 25)
-    says = [(Severity.WARNING, f"edgevpr: GPS is {off_m} m from the map's position") for off_m in (100, 201)]
-    assert watched.link.texts() == [*says, (Severity.INFO, "edgevpr: GPS agrees with the map again")]
+    notes = [(Severity.WARNING, format_note(ReasonCode.GPS_DIFFERS, distance_m=off_m)) for off_m in (100, 201)]
+    assert watched.link.texts() == [*notes, (Severity.INFO, format_note(ReasonCode.GPS_AGREES))]
     assert watched.distances_m()[:5] == pytest.approx([100.0, 100.0, 100.0, 199.0, 201.0], abs=0.01)
 
 

@@ -3,8 +3,9 @@
 from types import SimpleNamespace
 
 import pytest
-from fakes import vehicle_at
+from fakes import format_note, vehicle_at
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.heightwatch import HeightWatch
@@ -29,7 +30,7 @@ class Watch:
                     located=SimpleNamespace(height_m=height_m, height_ratio=ratio),
                 )
             )
-        return [text.removeprefix("edgevpr: ") for _, text in self.link.texts()]
+        return [text for _, text in self.link.texts()]
 
 
 @pytest.fixture
@@ -40,11 +41,11 @@ def watch(notifier, clock, link):
 def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
     assert watch.update(150, 160, 158, 162) == []
     assert watch.watch.ratio == 1.0
-    assert watch.update(155) == ["height: autopilot 100 m, images 158 m"]
+    assert watch.update(155) == [format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=100.0, image_height_m=158.0)]
     assert watch.watch.ratio == pytest.approx(1.58)
     watch.update(*[200] * 5, 100, 100, 100, 100)
     assert len(watch.link.texts()) == 1
-    assert watch.update(100)[1:] == ["height agrees with images again"]
+    assert watch.update(100)[1:] == [format_note(ReasonCode.HEIGHT_AGREES)]
     assert watch.watch.ratio == 1.0
     assert [(line["kind"], line["note"]) for line in read_log(tmp_path / "log")] == [
         ("height", {"code": "HEIGHT_DIFFERS", "parameters": {"autopilot_height_m": 100.0, "image_height_m": 158.0}}),
@@ -63,7 +64,9 @@ def test_ratio_sd_is_the_deviation_of_the_newest_match(watch):
 
 
 def test_heightwatch_bears_a_reported_height_of_zero(watch):
-    assert watch.update(*[100] * 5, reported_m=0.0) == ["height: autopilot 1 m, images 100 m"]
+    assert watch.update(*[100] * 5, reported_m=0.0) == [
+        format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=1.0, image_height_m=100.0)
+    ]
     assert watch.watch.ratio == 100.0
 
 

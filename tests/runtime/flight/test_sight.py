@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fakes import FakeSource
+from fakes import FakeSource, format_note
 from flights import pictures, select
 
 from edgevpr.core.config import load_config
@@ -13,6 +13,11 @@ from edgevpr.frames.level import View
 from edgevpr.runtime.flight.camerawatch import TurnWatch
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.watching import MapCoverageWatch
+
+MAP_LEFT = format_note(ReasonCode.MAP_LEFT)
+MAP_FOUND = format_note(ReasonCode.MAP_FOUND)
+TILT_TOO_LARGE = format_note(ReasonCode.TILT_TOO_LARGE)
+TILT_FINE = format_note(ReasonCode.TILT_FINE)
 
 
 class SightFlight:
@@ -38,7 +43,7 @@ class SightFlight:
                     frame=SimpleNamespace(t_mono_s=self.clock.now_s),
                 )
             )
-        return [text.removeprefix("edgevpr: ") for _, text in self.link.texts()]
+        return [text for _, text in self.link.texts()]
 
 
 @pytest.fixture
@@ -48,10 +53,10 @@ def sight_flight(notifier, clock, link):
 
 def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_matches(sight_flight, tmp_path):
     assert sight_flight.query("+++" + "-" * 29) == []
-    assert sight_flight.query("-") == ["aircraft has left the map"]
-    assert sight_flight.query("-" * 50) == ["aircraft has left the map"]
-    assert sight_flight.query("+--") == ["aircraft has left the map"]
-    assert sight_flight.query("+") == ["aircraft has left the map", "aircraft is back on the map"]
+    assert sight_flight.query("-") == [MAP_LEFT]
+    assert sight_flight.query("-" * 50) == [MAP_LEFT]
+    assert sight_flight.query("+--") == [MAP_LEFT]
+    assert sight_flight.query("+") == [MAP_LEFT, MAP_FOUND]
     assert [(line["kind"], line["note"]["code"]) for line in read_log(tmp_path / "log")] == [
         ("sight", "MAP_LEFT"),
         ("sight", "MAP_FOUND"),
@@ -63,9 +68,9 @@ def test_sight_reports_the_map_left_after_thirty_queries_and_found_after_two_mat
     ("outcomes", "texts"),
     [
         ("+++" + "L" * 9, []),
-        ("+++" + "L" * 10, ["aircraft has left the map"]),  # the flight knows to be lost
+        ("+++" + "L" * 10, [MAP_LEFT]),  # the flight knows to be lost
         ("-" * 100 + "++" + "-" * 100, []),  # it was hardly ever recognised
-        ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, ["aircraft has left the map"]),  # matches far apart
+        ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, [MAP_LEFT]),  # matches far apart
     ],
 )
 def test_sight_requires_several_queries_to_leave_or_find_the_map(sight_flight, outcomes, texts):
@@ -74,22 +79,22 @@ def test_sight_requires_several_queries_to_leave_or_find_the_map(sight_flight, o
 
 @pytest.mark.parametrize("outcome", "0xtnu")
 def test_sight_ignores_queries_without_information_about_the_map(sight_flight, outcome):
-    assert "aircraft has left the map" not in sight_flight.query("+++" + "-" * 29 + outcome * 40)
-    assert sight_flight.query("-")[-1] == "aircraft has left the map"
+    assert MAP_LEFT not in sight_flight.query("+++" + "-" * 29 + outcome * 40)
+    assert sight_flight.query("-")[-1] == MAP_LEFT
 
 
 def test_sight_reports_tilt_after_five_seconds_and_its_end(sight_flight, tmp_path):
     assert sight_flight.query("-" + "t" * 5) == []
-    assert sight_flight.query("t") == ["tilt too large"]
-    assert sight_flight.query("-----") == ["tilt too large"]
-    assert sight_flight.query("-") == ["tilt too large", "tilt is acceptable again"]
+    assert sight_flight.query("t") == [TILT_TOO_LARGE]
+    assert sight_flight.query("-----") == [TILT_TOO_LARGE]
+    assert sight_flight.query("-") == [TILT_TOO_LARGE, TILT_FINE]
     assert [line["kind"] for line in read_log(tmp_path / "log")] == ["tilt", "tilt"]
 
 
 @pytest.mark.slow
 def test_sight_reports_a_flight_that_leaves_its_map_and_returns(make_flight, clock, link):
     lines = make_flight().fly(FakeSource([*pictures(8), *pictures(40, first=100), *pictures(8)], clock))
-    assert link.texts() == [(4, "edgevpr: aircraft has left the map"), (6, "edgevpr: aircraft is back on the map")]
+    assert link.texts() == [(4, MAP_LEFT), (6, MAP_FOUND)]
     assert [line["note"]["code"] for line in select(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
 
 
@@ -123,7 +128,7 @@ def test_mirrored_images_are_reported_once_and_only_if_none_matches(make_flight,
     mirrored = [np.flip(picture, axis).copy() for picture in pictures(8)]
     lines = make_flight().fly(FakeSource([*mirrored, *mirrored, *mirrored[:4]], clock))
     assert not any(line["accepted"] for line in select(lines, "query"))
-    assert link.texts() == [(4, "edgevpr: images are mirrored")]
+    assert link.texts() == [(4, f"edgevpr: {ReasonCode.IMAGES_MIRRORED.summary}")]
     (line,) = select(lines, "camera")
     assert line["note"]["code"] == "IMAGES_MIRRORED"
 

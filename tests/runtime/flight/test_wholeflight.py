@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -61,7 +62,7 @@ def test_select_last_flight_reports_a_missing_file_and_reads_the_rest(path, log_
     log_files[3].unlink()
     whole = select_last_flight(path)
     assert numbers(whole) == [100, 102, 103]
-    assert whole.missing == f"Files of this flight before {path} are missing (1): it is read without them."
+    assert (str(path) in whole.missing, "(1)" in whole.missing) == (True, True)
 
 
 def test_select_last_flight_skips_truncated_lines_of_each_file(path, log_files):
@@ -93,5 +94,5 @@ def test_select_last_flight_refuses_other_files_in_one_sentence(tmp_path):
     with pytest.raises(EdgevprError, match="no flight-log lines"):
         select_last_flight(tmp_path / "empty")
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
-        with pytest.raises(UsageError, match="no flight log"):
+        with pytest.raises(UsageError, match=re.escape(str(missing))):
             select_last_flight(missing)

