@@ -61,7 +61,7 @@ def test_judged_by_the_control(changed, verdict):
     assert row["is_right"] == (verdict in ("right", "refused"))
     page = verdicts.page({"cells": [row], "commit": "abc", "date": "today", "machine": {"cpu": "one"}})
     assert f"| {verdict} |" in page
-    assert "* gps_input-gps_back-none: map left" in page
+    assert f"* {name}: {FLOWN['texts'][0]}" in page
 
 
 def test_figures_of_a_flight(tmp_path):

@@ -41,7 +41,7 @@ def test_measure_writes_one_file_per_set_and_its_summary_lines(tmp_path):
     page = (tmp_path / "out" / "sets.md").read_text()
     assert "| technique | RAM B/place | meadow (report, 4) |" in page
     assert "| cohog | 170 | 1.00 |" in page
-    assert "* grief_stromovka_monthly: five places only" in page
+    assert f"* grief_stromovka_monthly: {run_sets.FIVE_PLACES}" in page
 
 
 def test_measure_places_site_sets_and_measures_known_headings(tmp_path):

@@ -261,4 +261,4 @@ def test_folder_of_stereo_pictures_gives_no_frame(tmp_path):
         cv2.imwrite(str(tmp_path / f"{step}.png"), np.hstack(stereo_pair(scene, 4)))
     problems = []
     assert not any(read_to_end(open_source(str(tmp_path), live=False), problems.append))
-    assert [isinstance(problem, ImageError) and "left and right" in str(problem) for problem in problems] == [True] * 3
+    assert [isinstance(problem, ImageError) and " left " in str(problem) for problem in problems] == [True] * 3
