@@ -22,8 +22,8 @@ def picture(number):
     return np.roll(cv2.GaussianBlur(_NOISE, (9, 9), 0), 7 * number, axis=1)
 
 
-def encode_image(number):
-    return bytes(cv2.imencode(".jpg", picture(number))[1])
+def encode_image(number, extension=".jpg"):
+    return bytes(cv2.imencode(extension, picture(number))[1])
 
 
 class Server:
@@ -65,26 +65,33 @@ def read_request(asked):
 
 
 def http(status, kind="text/plain", body=b"nothing"):
-    """An answer to every request: `body`."""
+    """An answer to every request: `body`, or what it returns for the number of the request."""
+    numbers = iter(range(10_000))
 
     def answer(connection, asked):
         read_request(asked)
-        head = f"HTTP/1.0 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n\r\n"
-        connection.sendall(head.encode() + body)
+        content = body(next(numbers)) if callable(body) else body
+        head = f"HTTP/1.0 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(content)}\r\n\r\n"
+        connection.sendall(head.encode() + content)
 
     return answer
 
 
-def multipart():
-    """A multipart stream of all pictures in turn."""
+def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connections=None):
+    """A multipart stream of all pictures in turn. The times of sending go into a list for each connection, in
+    `connections`."""
 
     def answer(connection, asked):
         read_request(asked)
         connection.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=part\r\n\r\n")
+        sent_s: list[float] = []
+        if connections is not None:
+            connections.append(sent_s)
         for number in itertools.count():
-            data = encode_image(number)
-            head = f"--part\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-            connection.sendall(head.encode() + data + b"\r\n")
+            data = encode_image(number, extension)
+            length = f"Content-Length: {len(data)}\r\n" if has_length else ""
+            sent_s.append(time.monotonic())
+            connection.sendall(f"--part\r\nContent-Type: {kind}\r\n{length}\r\n".encode() + data + b"\r\n")
             time.sleep(0.1)
 
     return answer

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.frame import VideoFrame
 
+    from edgevpr.frames.webpictures import ResponseFile
+
 # FFmpeg's messages are searched for reports of lost packets, then discarded: edgevpr reports faults in its own words.
 av.logging.set_level(av.logging.WARNING)
 av.logging.set_skip_repeated(False)
@@ -63,20 +65,25 @@ def open_decoder(
     options: dict[str, str],
     timeouts_s: tuple[float, float] | None = None,
     format_name: str | None = None,
+    file: "ResponseFile | None" = None,
 ) -> "VideoDecoder":
     """Open the stream or file `uri` with FFmpeg's `options`. `timeouts_s`: time limits in seconds for opening it and
-    for each read (None: no limits). `format_name`: name of its format (None: FFmpeg detects it). Raises OpeningError
-    with the cause on failure or without video."""
+    for each read (None: no limits). `format_name`: name of its format (None: FFmpeg detects it). `file`: an open file
+    to read instead, which the decoder closes. Raises OpeningError with the cause on failure or without video."""
     with av.logging.Capture() as log_lines:
         try:
-            container = av.open(uri, "r", format=format_name, options=options, timeout=timeouts_s)
+            container = av.open(file or uri, "r", format=format_name, options=options, timeout=timeouts_s)
         except (av.FFmpegError, OSError, ValueError) as error:
             messages = [message for _, _, message in log_lines]
+            if file:
+                file.close()
             raise _explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
     if container.streams.video and getattr(container.streams.video[0], "codec_context", None):  # None: unknown codec
-        return VideoDecoder(container, _has_loss(log_lines))
+        return VideoDecoder(container, _has_loss(log_lines), file)
     has_video = bool(container.streams.video)
     container.close()
+    if file:
+        file.close()
     raise OpeningError("the codec is unknown to FFmpeg" if has_video else "no video in the stream")
 
 
@@ -125,8 +132,10 @@ class VideoDecoder:
     `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead during the opening, but not which ones. All
     packets are rejected until this is set to False."""
 
-    def __init__(self, container: "InputContainer", is_backlog_doubtful: bool) -> None:
-        self.container, self.stream = container, container.streams.video[0]
+    def __init__(
+        self, container: "InputContainer", is_backlog_doubtful: bool, file: "ResponseFile | None" = None
+    ) -> None:
+        self.container, self.stream, self._file = container, container.streams.video[0], file
         self.unit_s = float(self.stream.time_base or 1e-6)  # of the timestamps
         self.is_stamped = not container.format.flags & _NO_STAMPS_FLAG
         self.is_backlog_doubtful = is_backlog_doubtful
@@ -206,6 +215,8 @@ class VideoDecoder:
     def close(self) -> None:
         """Close the file or the connection."""
         self.container.close()
+        if self._file:
+            self._file.close()
 
     def _decode_packet(self, packet: "Packet[Any]") -> "list[VideoFrame] | Refusal":
         with av.logging.Capture():

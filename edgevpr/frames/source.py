@@ -23,6 +23,7 @@ from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, Strea
 from edgevpr.frames.stereo import StereoCheck
 
 _READ_TIMEOUT_S = 1.0
+_SNAPSHOT_PERIOD_S = 0.5
 _PROGRAM_PATTERN = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
 # udp://:PORT: on all interfaces.
 _ADDRESS_PATTERN = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
@@ -168,11 +169,12 @@ def open_source(
 ) -> Source:
     """Open the source at `uri`: a path, device or address.
 
-    `step_s`: minimum video time in seconds between two frames of a video file (None: every frame). `positions`:
-    position table of a recording (None: for a folder, the positions.csv in or next to it, else EXIF data; for a video,
-    the .csv of the same name next to it). `live`: allow cameras and streams, which never end. A missing one is opened
-    once it appears. `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None:
-    all). `steps_s`: for a folder that is replayed at its original times, the result of `read_intervals`.
+    `step_s`: minimum video time in seconds between two frames of a video file (None: every frame); for the address of a
+    single image, seconds between two requests (None: 0.5). `positions`: position table of a recording (None: for a
+    folder, the positions.csv in or next to it, else EXIF data; for a video, the .csv of the same name next to it).
+    `live`: allow cameras and streams, which never end. A missing one is opened once it appears. `clock`: the
+    monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
+    that is replayed at its original times, the result of `read_intervals`.
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
@@ -185,7 +187,7 @@ def open_source(
             raise SourceError(f"{uri} is live and never ends: use a folder of images or a video file instead.")
         from edgevpr.frames.live import LiveSource
 
-        return LiveSource(_make_capture(uri, clock), clock)
+        return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
     if not path.is_file():
         raise SourceError(f"{uri} does not exist: choose {SOURCE_HELP}.")
     if path.name.lower().endswith(EXTENSIONS):
@@ -232,9 +234,9 @@ def find_missing_cause(uri: str) -> str | None:
     return None
 
 
-def _make_capture(uri: str, clock: Callable[[], float]) -> Callable[[], Capture]:
-    """Return a function that opens the camera or stream `uri`. Raises SourceError if opening can never succeed; a
-    missing device or file may appear later."""
+def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
+    """Return a function that opens the camera or stream `uri`. `period_s`: seconds between requests, if each image
+    must be requested. Raises SourceError if opening can never succeed; a missing device or file may appear later."""
     if is_program_uri(uri):
         from edgevpr.frames.programs import open_program, require_program  # loads FFmpeg
 
@@ -259,6 +261,6 @@ def _make_capture(uri: str, clock: Callable[[], float]) -> Callable[[], Capture]
             return open_device(uri, clock)
         from edgevpr.frames.streams import open_address  # loads FFmpeg
 
-        return open_address(uri, clock)
+        return open_address(uri, clock, period_s)
 
     return open_capture

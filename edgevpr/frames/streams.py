@@ -11,6 +11,7 @@ from edgevpr.frames.age import HIDDEN_DELAY_SD_S, CaptureTime, StampedTime, Unst
 from edgevpr.frames.decoding import TimedPacket, TransportError, VideoDecoder, open_decoder
 from edgevpr.frames.rtp import describe_rtp
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
+from edgevpr.frames.webpictures import ResponseFile, SnapshotCapture, try_request
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -28,7 +29,6 @@ _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": 
 _UDP_OPTIONS = {"rtsp_transport": "udp", "fpsprobesize": "0"}
 _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
 _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # otherwise FFmpeg probes for the frame rate for up to 5 s
-_IMAGE_FORMATS = "_pipe"  # end of the names of FFmpeg's formats of single images
 _SKIPPABLE_AGE_S = 0.3  # a packet queued for longer is skipped if a later key frame has arrived
 _MAX_PACKET_AGE_S = 5.0  # a packet queued for longer is always skipped
 _MAX_QUEUED_BYTES = 16_000_000  # five seconds of 25 Mbit/s
@@ -36,15 +36,26 @@ _MAX_QUEUED_PACKETS = 2000
 _CLOSE_TIMEOUT_S = 0.5
 
 
-def open_address(uri: str, clock: Callable[[], float]) -> "StreamCapture":
-    """Open a network stream or an .sdp file. `clock` is the monotonic clock, in seconds. Raises OpeningError with the
-    cause."""
+def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | SnapshotCapture":
+    """Open a network stream, an .sdp file, or the address of a single image, which is requested every `period_s`
+    seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
-    decoder = _open_stream(uri)
-    if decoder.container.format.name.endswith(_IMAGE_FORMATS):
-        decoder.close()
-        raise OpeningError("a single image at this address, no video")
-    return StreamCapture(decoder, clock, opened_s)
+    response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
+    content_type = response.headers.get_content_type() if response else ""
+    timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
+    if response and content_type.startswith("multipart/"):
+        parts = ResponseFile(response, is_multipart=True)
+        return StreamCapture(open_decoder(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
+    if response and content_type == "application/octet-stream":  # if FFmpeg is the server, it answers one request only
+        file = ResponseFile(response, is_multipart=False)
+        return StreamCapture(open_decoder(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
+    if response:
+        response.close()
+    if content_type.startswith("image/"):
+        return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock)
+    if content_type == "text/html":
+        raise OpeningError(f"no video at this address, only {content_type}")
+    return StreamCapture(_open_stream(uri), clock, opened_s)
 
 
 def open_raw(

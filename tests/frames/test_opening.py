@@ -5,15 +5,19 @@ import contextlib
 import socket
 import threading
 import time
+from statistics import median
 
 import pytest
 from answering_cameras import (
     HEIGHT,
+    RATE_HZ,
     WIDTH,
     Server,
     encode_image,
     http,
     multipart,
+    picture,
+    read_request,
     rtsp,
     send_rtp,
 )
@@ -23,7 +27,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import streams
 from edgevpr.frames.devices import open_device
-from edgevpr.frames.shot import OpeningError
+from edgevpr.frames.shot import Condition, OpeningError, Shot
 from edgevpr.frames.source import open_source
 from edgevpr.frames.streams import open_address
 from edgevpr.runtime.service import camera
@@ -58,7 +62,7 @@ def start_sending():
 
 def find_cause(uri):
     with pytest.raises(OpeningError) as refusal:
-        open_address(uri, lambda: 0.0)
+        open_address(uri, lambda: 0.0, 0.5)
     return str(refusal.value)
 
 
@@ -85,8 +89,7 @@ def hang(connection, asked):
         ("http://", http("403 Forbidden"), "access forbidden (403)"),
         ("http://", http("404 Not Found"), "no stream at this path (404)"),
         ("http://", http("500 Internal Server Error"), "refused by the camera (500)"),
-        ("http://", http("200 OK", "text/html", b"<html>log in</html>"), "no video that FFmpeg can read"),
-        ("http://", http("200 OK", "image/jpeg", encode_image(0)), "a single image at this address, no video"),
+        ("http://", http("200 OK", "text/html", b"<html>log in</html>"), "no video at this address, only text/html"),
         ("http://", hang, "no answer within 0.7 s"),
     ],
 )
@@ -128,7 +131,7 @@ def test_open_source_finds_no_password_in_a_path_with_an_at_sign(uri, open_live_
 def test_open_address_decodes_a_percent_encoded_password(serve):
     right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
     address = serve(rtsp("401 Unauthorized", header=BASIC, authorization=right))
-    stream = open_address(f"rtsp://pilot:{PASSWORD}@{address}/stream", lambda: 0.0)
+    stream = open_address(f"rtsp://pilot:{PASSWORD}@{address}/stream", lambda: 0.0, 0.5)
     assert stream.facts.codec == "h264"
     stream.release()
 
@@ -195,10 +198,25 @@ def test_rtp_of_an_unknown_codec_asks_for_a_description(start_sending):
     assert ("98" in cause, ".sdp" in cause) == (True, True)
 
 
-def test_multipart_stream_is_read_in_order(open_live_source, serve):
-    source = open_live_source(f"http://{serve(multipart())}/video")
+@pytest.mark.parametrize("has_length", [True, False])
+@pytest.mark.parametrize(("kind", "extension"), [("image/jpg", ".jpg"), ("image/png", ".png")])
+def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, open_live_source, serve):
+    source = open_live_source(f"http://{serve(multipart(kind, extension, has_length))}/video")
     numbers = [int(first_frame(source).name.split()[1]) for _ in range(3)]
     assert numbers == sorted(set(numbers))
+
+
+def test_multipart_stream_without_lengths_does_not_wait_for_the_next_part(open_live_source, serve):
+    """FFmpeg gives such a picture when the next one has come, as if it had been taken then."""
+    connections: list[list[float]] = []
+    source = open_live_source(f"http://{serve(multipart(has_length=False, connections=connections))}/video")
+    late_s = []
+    for _ in range(12):
+        frame = first_frame(source)
+        sent_s = connections[-1]  # the first was FFmpeg's
+        (number,) = (at for at in range(len(sent_s)) if abs(frame.image.astype(int) - picture(at)).mean() < 4)
+        late_s.append(frame.t_mono_s - sent_s[number])
+    assert median(late_s) < 0.7 / RATE_HZ
 
 
 def test_connection_of_a_multipart_stream_is_closed_with_the_capture(serve):
@@ -211,10 +229,57 @@ def test_connection_of_a_multipart_stream_is_closed_with_the_capture(serve):
         except OSError:
             is_closed.set()
 
-    capture = open_address(f"http://{serve(answer)}/video", time.monotonic)
+    capture = open_address(f"http://{serve(answer)}/video", time.monotonic, 0.1)
     capture.read()
     capture.release()
     assert is_closed.wait(PATIENCE_S)
+
+
+def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
+    asked_s: list[float] = []
+
+    def taken(number):
+        asked_s.append(time.monotonic())
+        time.sleep(0.05)
+        return encode_image(number)
+
+    address = serve(http("200 OK", "image/jpeg", taken))
+    capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
+    first, second = capture.read(), capture.read()
+    assert not (first.convert() == second.convert()).all()
+    assert first.convert().shape == (HEIGHT, WIDTH, 3)
+    assert asked_s[-3] < first.t_mono_s <= asked_s[-2]
+    assert first.t_mono_s + 0.1 <= second.t_mono_s <= asked_s[-1]
+
+
+def test_snapshots_cached_by_the_camera_are_aged_from_the_previous_request(serve):
+    address = serve(http("200 OK", "image/jpeg", lambda number: encode_image(number // 2)))
+    capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
+    *_, last = (capture.read() for _ in range(4))
+    assert time.monotonic() - last.t_mono_s > 0.1
+
+
+def test_snapshots_truncated_are_damaged_and_failed_ones_lost(open_live_source, serve):
+    pictures = iter([encode_image(0), encode_image(1), encode_image(2)[:900], b""])
+    server = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
+    source = open_live_source(f"http://{server.address}/snapshot.jpg")
+    wait_until(lambda: source.refused["damaged"] >= 1)
+    server.close()
+    wait_until(lambda: source.condition is Condition.LOST)
+
+
+def test_snapshots_accept_a_password(serve):
+    right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
+
+    def answer(connection, asked):
+        _, headers = read_request(asked)
+        is_right = headers.get("authorization") == right
+        picture, status = (encode_image(0), "200 OK") if is_right else (b"", f"401 Unauthorized\r\n{BASIC}")
+        head = f"HTTP/1.0 {status}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+        connection.sendall(head.encode() + picture)
+
+    capture = open_address(f"http://pilot:{PASSWORD}@{serve(answer)}/snapshot.jpg", lambda: 0.0, 0.5)
+    assert isinstance(capture.read(), Shot)
 
 
 def check_source(uri):
@@ -223,7 +288,7 @@ def check_source(uri):
 
 
 def test_check_frame_has_the_facts_of_the_first_picture_and_refuses_an_old_one(serve, monkeypatch):
-    uri = f"http://{serve(multipart())}/video"
+    uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
     code, found = check_source(uri)
     assert (code, found["width"], found["height"]) == (FindingCode.FRAME_RECEIVED, WIDTH, HEIGHT)
     assert [fact.split()[0] for fact in found["facts"].split(", ")] == ["mjpeg", "8", "square"]
