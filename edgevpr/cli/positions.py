@@ -1,4 +1,4 @@
-"""`edgevpr positions`: geotag pictures from a log, a track or subtitles."""
+"""`edgevpr positions`: geotag pictures from a log, a track, subtitles or a table."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -9,12 +9,13 @@ from edgevpr.cli.shared import add_command, add_json, print_result
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    text = "geotag images from an autopilot log, a GPS track or subtitles"
+    text = "geotag images from an autopilot log, a GPS track, subtitles or a table"
     parser = add_command(commands, "positions", run_positions, text)
     parser.add_argument(
         "record",
         metavar="RECORD",
-        help="ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, or the flight log (.jsonl) of a recorded flight",
+        help="ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, the flight log (.jsonl) of a recorded flight, or a "
+        "table from exiftool, Pix4D, Metashape or OpenDroneMap",
     )
     parser.add_argument("--images", required=True, metavar="SOURCE", help="folder of images, or video file")
     parser.add_argument(

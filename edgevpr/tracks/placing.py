@@ -44,8 +44,7 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
     paths = list_images(folder)
     exif_tags = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
     if record.tags_by_name:
-        tags = {name: tag for name, tag in record.tags_by_name.items() if name in exif_tags and tag.position}
-        how = "by name"
+        tags, how = _match_names(record.tags_by_name, list(exif_tags)), "by name"
     elif len(record.shots) == len(exif_tags):
         tags, how = dict(zip(exif_tags, record.shots, strict=True)), "in the order of the autopilot's camera triggers"
     elif record.track and record.is_utc:
@@ -60,6 +59,14 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
         raise UsageError(f"The {record.kind} lists none of the images in {folder}: pass the folder of its images.")
     tags = {name: _fill_tag(tag, exif_tags[name]) for name, tag in tags.items()}
     return Placement(how=how, tags=tags, pictures=len(exif_tags))
+
+
+def _match_names(tags: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
+    """Match pictures by full name or else by name without extension, ignoring case."""
+    tags_by_name = {name.casefold(): tag for name, tag in tags.items()}
+    tags_by_stem = {Path(name).stem.casefold(): tag for name, tag in tags.items()}
+    matches = {name: tags_by_name.get(name.casefold(), tags_by_stem.get(Path(name).stem.casefold())) for name in names}
+    return {name: tag for name, tag in matches.items() if tag and tag.position}
 
 
 def _match_times(track: Track, folder: Path, exif_tags: Mapping[str, GeoTag], offset_s: float | None) -> Placement:

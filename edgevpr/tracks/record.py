@@ -1,5 +1,5 @@
-"""Recordings of an aircraft's path: autopilot logs, subtitles of drone videos, and receiver tracks. `read_record`
-detects the type of a file."""
+"""Recordings of an aircraft's path: autopilot logs, subtitles of drone videos, receiver tracks, and tables from other
+programs. `read_record` detects the type of a file."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ class Record:
     `kind`: type of recording, in words. `track`: position and attitude over time (None: no times). `is_utc`: the
     times of the track are seconds since 1970; otherwise seconds from the first frame of the video that it belongs to.
     `shots`: what the autopilot logged for each picture that it triggered, in order. `tags_by_name`: position and
-    attitude by picture name, from a log that names pictures."""
+    attitude by picture name, from a table that names pictures."""
 
     kind: str
     track: Track | None = None
@@ -31,12 +31,12 @@ class Record:
 
 
 def read_record(path: Path) -> Record:
-    """Read a recording. The extension determines its type. Raises UsageError for a file of another type, and for one
-    that cannot be read or has no position."""
-    from edgevpr.tracks import edgevpr_logs, gpx, logs, srt
+    """Read a recording. The extension determines its type: .bin, .log, .tlog, .ulg, .srt, .gpx or .jsonl; any other
+    file is a table. Raises UsageError for a file that cannot be read or has no position."""
+    from edgevpr.tracks import edgevpr_logs, gpx, logs, srt, tables
 
     if not path.is_file():
-        raise UsageError(f"{path} does not exist: choose a log, a track or subtitles.")
+        raise UsageError(f"{path} does not exist: choose a log, a track, subtitles or a table.")
     readers: dict[str, Callable[[Path], Record]] = {
         ".bin": logs.read_ardupilot,
         ".log": logs.read_ardupilot,
@@ -46,13 +46,7 @@ def read_record(path: Path) -> Record:
         ".gpx": gpx.read_gpx,
         ".jsonl": edgevpr_logs.read_flight,
     }
-    read = readers.get(path.suffix.lower())
-    if read is None:
-        raise UsageError(
-            f"{path} is none of {', '.join(readers)}: save a table as positions.csv next to the images, with "
-            "commas and the columns file, lat and lon."
-        )
-    record = read(path)
+    record = readers.get(path.suffix.lower(), tables.read_table)(path)
     if not (record.track or record.shots or record.tags_by_name):
         raise UsageError(f"{path} ({record.kind}) has no position: did the receiver have a GPS fix?")
     return record

@@ -1,4 +1,4 @@
-"""Which picture was taken where: in order, by time and by how pictures move, and the command for people."""
+"""Which picture was taken where: by name, in order, by time and by how pictures move, and the command for people."""
 
 from datetime import datetime, timedelta, timezone
 
@@ -40,13 +40,15 @@ def points(count=15, lat_step=1e-4):
     return [(t, HOME[0] + lat_step * t, HOME[1], 120.0, 30.0, 0.0, 0.0, 0.0) for t in range(count)]
 
 
-def test_positions_fills_in_from_the_picture_and_overwrites_no_table(capsys, folder, tmp_path):
-    write_dataflash(tmp_path / "f.bin", points(), shots=points(6, lat_step=1e-3))
-    assert run("positions", tmp_path / "f.bin", "--images", folder) == 0
-    assert [line.split() for line in capsys.readouterr().out.splitlines()][2:4] == [["placed", "6"], ["of", "6"]]
+def test_positions_assigns_images_by_name(capsys, folder, tmp_path):
+    rows = "".join(f"D:\\pics\\img_{number}.tif;50.{number + 1};8\n" for number in range(5))
+    (tmp_path / "table.csv").write_text(f"imagename;latitude;longitude\n{rows}")
+    assert run("positions", tmp_path / "table.csv", "--images", folder) == 0
+    assert [line.split() for line in capsys.readouterr().out.splitlines()][2:4] == [["placed", "5"], ["of", "6"]]
     tags = read_positions(folder / "positions.csv")
-    assert tags["IMG_3.JPG"].t_utc_s == START_S + 7, "what the log does not say is taken from the picture"
-    assert "already exists" in refused(capsys, "positions", tmp_path / "f.bin", "--images", folder)
+    assert tags["IMG_3.JPG"].position.lat_deg == pytest.approx(50.4)
+    assert tags["IMG_3.JPG"].t_utc_s == START_S + 7, "what the table does not say is taken from the picture"
+    assert "already exists" in refused(capsys, "positions", tmp_path / "table.csv", "--images", folder)
 
 
 def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):

@@ -123,9 +123,33 @@ def test_read_record_reads_each_subtitle_format(tmp_path, form):
 
 
 @pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("imagename;latitude;longitude;altitude\nC:\\f\\a.JPG;50,25;8,5;120\n", (50.25, 8.5, 120)),
+        ("SourceFile,GPSLatitude,GPSLongitude\n./f/a.JPG,\"50 deg 15' 0.00\"\" S\",\"8 deg 30' 0.00\"\" W\"\n",
+         (-50.25, -8.5, None)),
+        ("#Label,X/Longitude,Y/Latitude,Z/Altitude\na.JPG,8.5,50.25,120\n", (50.25, 8.5, 120)),
+        ("EPSG:4326\na.JPG 8.5 50.25 120\n", (50.25, 8.5, 120)),
+        ("a.JPG,50.25,8.5,120\nb.JPG,50.26,8.5,120\n", (50.25, 8.5, 120)),
+        ("\ufefffile\tVehicle Latitude [deg]\tVehicle Longitude [deg]\na.JPG\t50.25 N\t8.5 E\n", (50.25, 8.5, None)),
+    ],
+)  # fmt: skip
+def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expected):
+    (tmp_path / "table.csv").write_text(text)
+    record = read_record(tmp_path / "table.csv")
+    at = record.tags_by_name["a.JPG"].position
+    assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
+    assert "separated by" in record.kind
+
+
+@pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("t.csv", b"file,lat,lon\na.jpg,50,8\n", "save a table as positions.csv"),
+        ("t.csv", b"file,x,y\na.jpg,1,2\n", "line 1"),
+        ("t.csv", b"EPSG:32632\na.jpg 1 2 3\n", "WGS 84"),
+        ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "is invalid"),
+        ("t.csv", b"file,lat,lon\na.jpg,150,200\n", "swapped"),
+        ("t.csv", bytes(range(256)), "UTF-8"),
         ("t.bin", b"", "log"),
         ("t.bin", struct.pack("64x"), "no position"),
         ("t.log", b"nothing\n", "no position"),
