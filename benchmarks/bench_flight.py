@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import base  # noqa: F401
 from base import Row
 from big_map import make_big_map
-from flight_process import cpu_s, start, wait_for, watch_memory, write_frames
+from flight_process import read_cpu_s, start, wait_for, watch_memory, write_frames
 
 from edgevpr.techniques import create
 
@@ -115,9 +115,9 @@ def idle_share(place_map: Path, source: Path | str, log: Path, *flags: str, unti
     flight = start(place_map, source, log, *FLAGS, *flags)
     wait_for(until, log, flight)
     time.sleep(SETTLE_S)
-    before_s, begin_s = cpu_s(flight.pid), time.monotonic()
+    before_s, begin_s = read_cpu_s(flight.pid), time.monotonic()
     time.sleep(IDLE_S)
-    share = (cpu_s(flight.pid) - before_s) / (time.monotonic() - begin_s)
+    share = (read_cpu_s(flight.pid) - before_s) / (time.monotonic() - begin_s)
     flight.terminate()
     assert finished(flight) == 0
     return share

@@ -27,7 +27,7 @@ import base
 import numpy as np
 import walks
 from base import Row
-from flight_process import memory_mb
+from flight_process import read_memory_mb
 from foreign_places import MIRRORED, foreign
 from run_sets import join
 
@@ -182,7 +182,7 @@ def measured(camera: str, count: int) -> Row:
                 beside += is_beside
                 wrong += [] if is_beside else [(query.path.name, ranked[0])]
             costs.append((event.steps.encode.cpu_s, event.steps.scan.cpu_s, event.cost.cpu_s))
-        peak_mb = memory_mb("self")["VmHWM"]
+        peak_mb = read_memory_mb("self")["VmHWM"]
     t_encode_ms, t_scan_ms, t_query_ms = (1000 * np.median(costs, axis=0)).round(2).tolist()
     spec = recogniser.technique.spec
     row = {

@@ -13,7 +13,7 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
 
-def data_of(content: str) -> Any:
+def read_page_data(content: str) -> Any:
     """The data of a page for its script."""
     return json.loads(re.search(r'id="page">(.*?)</script>', content)[1])
 

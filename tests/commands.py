@@ -18,7 +18,7 @@ def run_json(capsys, *argv):
     return json.loads(capsys.readouterr().out)
 
 
-def refused(capsys, *argv, code=2, is_alone=False) -> str:
+def expect_refusal(capsys, *argv, code=2, is_alone=False) -> str:
     """Return the one sentence with which a command fails. `is_alone`: nothing else is shown, not even progress."""
     capsys.readouterr()
     assert run(*argv) == code
@@ -31,11 +31,11 @@ def refused(capsys, *argv, code=2, is_alone=False) -> str:
     return sentence
 
 
-def leaves(parser):
+def list_commands(parser):
     """The names of all commands, and their parsers."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for each in action.choices.values():
-                yield from leaves(each)
+                yield from list_commands(each)
             return
     yield parser.prog.partition(" ")[2], parser

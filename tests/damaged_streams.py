@@ -19,7 +19,7 @@ import numpy as np
 from answering_cameras import RTCP, RtspCamera
 from encoders import Encoder, describe_rtp
 from loopback import free_port
-from numbered_pictures import HEIGHT, WIDTH, numbers_in, picture
+from numbered_pictures import HEIGHT, WIDTH, picture, read_numbers
 
 from edgevpr.frames.decoding import TimedPacket, VideoDecoder
 from edgevpr.frames.shot import Condition
@@ -177,7 +177,7 @@ class LossyCamera(Camera):
                 out.sendto(datagram, self._viewer)
 
 
-def streams(seed: int) -> dict[str, Callable[[Film], Camera]]:
+def list_cameras(seed: int) -> dict[str, Callable[[Film], Camera]]:
     """Return what makes the camera of each stream, by name, with damage drawn from a seed."""
     cameras: dict[str, Callable[[Film], Camera]] = {}
     for kind in _MJPEG:
@@ -190,20 +190,20 @@ def streams(seed: int) -> dict[str, Callable[[Film], Camera]]:
 
 
 def _damage(kind: str, dice: random.Random) -> Callable[[bytes], bytes]:
-    def corrupted(jpeg: bytes) -> bytes:
+    def corrupt(jpeg: bytes) -> bytes:
         damaged = bytearray(jpeg)
         for _ in range(5):
             damaged[dice.randrange(len(damaged))] = dice.randrange(256)
         return bytes(damaged)
 
-    def now_and_then(damage: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    def damage_some(damage: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
         return lambda jpeg: damage(jpeg) if dice.random() < 0.5 else jpeg
 
     return {
         "whole": lambda jpeg: jpeg,
         "cut to 15 %": lambda jpeg: jpeg[: len(jpeg) * 15 // 100],
-        "bytes corrupted": now_and_then(corrupted),
-        "truncated": now_and_then(lambda jpeg: jpeg[: dice.randrange(len(jpeg))]),
+        "bytes corrupted": damage_some(corrupt),
+        "truncated": damage_some(lambda jpeg: jpeg[: dice.randrange(len(jpeg))]),
     }[kind]
 
 
@@ -231,7 +231,7 @@ def run(
     """Send `count` pictures over every stream whose name is wanted, and judge what is delivered; then over some once
     more, with a decoder that is too slow for them."""
     film = Film(count=count, rate_hz=rate_hz)
-    cameras = streams(seed)
+    cameras = list_cameras(seed)
     rows = [_judge(name, make(film)) for name, make in cameras.items() if only(name)]
     for name in _TOO_SLOW:
         slow = f"{name}, decoded too slowly"
@@ -244,11 +244,11 @@ def run(
 def _slow_down(decode: Callable[..., object], work_s: float) -> Callable[..., object]:
     """Let every packet take so much longer to decode."""
 
-    def slowly(whole: VideoDecoder, fetched: TimedPacket) -> object:
+    def decode_slowly(whole: VideoDecoder, fetched: TimedPacket) -> object:
         time.sleep(work_s)
         return decode(whole, fetched)
 
-    return slowly
+    return decode_slowly
 
 
 def _judge(stream: str, camera: Camera) -> Row:
@@ -261,7 +261,7 @@ def _judge(stream: str, camera: Camera) -> Row:
     while (frame := source.read(0.05)) or not (camera.done.is_set() and source.condition is Condition.LOST):
         if frame is None:
             continue
-        numbers = numbers_in(frame.image)
+        numbers = read_numbers(frame.image)
         known = [number for number in numbers if number in camera.sent_s]
         looked_at += 1
         old += any(frame.t_mono_s - camera.sent_s[number] > OLD_S for number in known)

@@ -52,11 +52,11 @@ class DistortedCamera:
         return path
 
 
-def wide():
+def make_wide_camera():
     """A wide-angle lens with barrel distortion, as of an action camera: 100 degrees across."""
     return DistortedCamera(352.0, (-0.3, 0.09, 0.0, 0.0), centre_px=(327.0, 233.0))
 
 
-def fisheye():
+def make_fisheye_camera():
     """An equidistant fisheye of 140 degrees across."""
     return DistortedCamera(262.0, (0.02, -0.01, 0.003, -0.0005), fisheye=True, centre_px=(313.0, 244.0))

@@ -10,7 +10,7 @@ def fill(height: int, width: int, colour) -> np.ndarray:
     return np.full((height, width, 3), colour, np.uint8)
 
 
-def any_colour(rng: np.random.Generator, low: int = 0, high: int = 256) -> tuple[int, ...]:
+def draw_colour(rng: np.random.Generator, low: int = 0, high: int = 256) -> tuple[int, ...]:
     return tuple(int(value) for value in rng.integers(low, high, 3))
 
 
@@ -21,7 +21,7 @@ def write_text(
     height, width = picture.shape[:2]
     scale = size * height / 480 * rng.uniform(0.8, 1.2)
     where = int(at[0] * width), int(at[1] * height)
-    colour = (255, 255, 255) if rng.random() < 0.7 else any_colour(rng, 150)
+    colour = (255, 255, 255) if rng.random() < 0.7 else draw_colour(rng, 150)
     cv2.putText(picture, text, where, int(rng.choice(_FONTS)), scale, colour, int(rng.integers(1, 4)), cv2.LINE_AA)
 
 
@@ -39,7 +39,7 @@ def make_clouds(rng: np.random.Generator, height: int, width: int, finest: float
     return cv2.normalize(total, None, 0, 1, cv2.NORM_MINMAX)
 
 
-def colour_shares(share: np.ndarray, dark, light) -> np.ndarray:
+def blend_colours(share: np.ndarray, dark, light) -> np.ndarray:
     """Colour shares 0..1 (H, W) from one colour to another."""
     dark, light = (np.broadcast_to(np.asarray(colour, np.float32), 3) for colour in (dark, light))
     return np.clip(dark + share[..., None] * (light - dark), 0, 255).astype(np.uint8)

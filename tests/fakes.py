@@ -35,8 +35,8 @@ _STATES = {
 
 
 class FakeClock:
-    """A clock that moves when told to, and when somebody sleeps by it. Called, it is the monotonic clock; `at` lets
-    things happen while somebody sleeps."""
+    """A clock that moves when told to, and when somebody sleeps by it. Called, it is the monotonic clock; `schedule`
+    lets things happen while somebody sleeps."""
 
     def __init__(self, now_s: float = 1000.0) -> None:
         self.now_s, self.cpu_s, self.thread_cpu_s = now_s, 7.0, 3.0
@@ -56,7 +56,7 @@ class FakeClock:
     def utc_s(self) -> float:
         return 1.7e9 + self.now_s
 
-    def at(self, t_s: float, act: Callable[[], object]) -> None:
+    def schedule(self, t_s: float, act: Callable[[], object]) -> None:
         """Let `act` happen `t_s` seconds from now."""
         self._events = sorted([*self._events, (self.now_s + t_s, act)], key=lambda event: event[0])
 
@@ -129,7 +129,7 @@ class FakeSource:
         self._leave.clear()
 
 
-def to_autopilot(
+def make_output(
     link, navigator, clock: "FakeClock", flight_log: FlightLog | None = None, **settings
 ) -> AutopilotOutput:
     """An autopilot at a link, with keys of the section `mavlink`."""
@@ -258,13 +258,13 @@ def format_note(code: ReasonCode, **parameters: float) -> str:
     return f"edgevpr: {Reason(code, parameters)}"
 
 
-def receiver_at(at_deg: tuple[float, float], sd_m: float, t_s: float, **other) -> Receiver:
+def make_receiver(at_deg: tuple[float, float], sd_m: float, t_s: float, **other) -> Receiver:
     """What a GPS receiver reports that is there."""
     return Receiver(lat_deg=at_deg[0], lon_deg=at_deg[1], sd_m=sd_m, t_s=t_s, **other)
 
 
-def vehicle_at(lat_deg: float, lon_deg: float, t_received_s: float, **other) -> Vehicle:
+def make_vehicle(lat_deg: float, lon_deg: float, t_received_s: float, **other) -> Vehicle:
     """What an autopilot says that is there."""
     known = {"alt_m": 300.0, "heading_deg": None, "has_gps": True} | other
-    known.setdefault("gps", receiver_at((lat_deg, lon_deg), 1.0, t_received_s) if known["has_gps"] else None)
+    known.setdefault("gps", make_receiver((lat_deg, lon_deg), 1.0, t_received_s) if known["has_gps"] else None)
     return Vehicle(lat_deg=lat_deg, lon_deg=lon_deg, t_received_s=t_received_s, **known)

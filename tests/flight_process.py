@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 from loopback import free_port
 from mavlink_peers import AutopilotThread
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -25,7 +25,7 @@ def write_frames(folder: Path, count: int) -> None:
     """Write pictures as a camera gives them, 640x480 in colour, as JPEG files."""
     folder.mkdir()
     for number in range(count):
-        cv2.imwrite(str(folder / f"{number:04d}.jpg"), cv2.cvtColor(textured(number, 480, 640), cv2.COLOR_GRAY2BGR))
+        cv2.imwrite(str(folder / f"{number:04d}.jpg"), cv2.cvtColor(draw_texture(number, 480, 640), cv2.COLOR_GRAY2BGR))
 
 
 def start(
@@ -42,7 +42,7 @@ def start(
 
 
 @contextmanager
-def simulated_autopilot(**how):
+def serve_autopilot(**how):
     """A simulated flight controller: its link, and a call that ends it and returns what it has received."""
     port = free_port()
     autopilot = AutopilotThread(f"udpin:127.0.0.1:{port}", **how)
@@ -52,7 +52,7 @@ def simulated_autopilot(**how):
         autopilot.finish()
 
 
-def ended(process: subprocess.Popen, code: int = 0) -> str:
+def finish_flight(process: subprocess.Popen, code: int = 0) -> str:
     """Wait for the end of a flight, which must be with this code; return what it has said."""
     said = process.communicate(timeout=120)[1]
     assert process.returncode == code, said
@@ -60,7 +60,7 @@ def ended(process: subprocess.Popen, code: int = 0) -> str:
 
 
 @contextmanager
-def manager(folder: Path):
+def open_notify_socket(folder: Path):
     """systemd's end of the socket, and the environment that names it."""
     address = str(folder / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
@@ -84,7 +84,7 @@ def wait_for(kind: str, log: Path, process: subprocess.Popen, count: int = 1) ->
     raise RuntimeError(f"no line `{kind}` in {log} after {_PATIENCE_S:g} s")
 
 
-def memory_mb(pid: int | str) -> dict[str, float]:
+def read_memory_mb(pid: int | str) -> dict[str, float]:
     """VmHWM (the largest resident set so far), VmRSS, Pss, ... of a process, MB of 10^6 bytes; {} once it has ended."""
     try:
         text = Path(f"/proc/{pid}/status").read_text() + Path(f"/proc/{pid}/smaps_rollup").read_text()
@@ -95,18 +95,18 @@ def memory_mb(pid: int | str) -> dict[str, float]:
 
 
 def watch_memory(process: subprocess.Popen, every_s: float = 0.05) -> tuple[dict[str, float], str]:
-    """Until the flight ends: (the largest value of each figure of `memory_mb`, the names of all files mapped)."""
+    """Until the flight ends: (the largest value of each figure of `read_memory_mb`, the names of all files mapped)."""
     largest: dict[str, float] = {}
     mapped = ""
     while process.poll() is None:
-        for name, value in memory_mb(process.pid).items():
+        for name, value in read_memory_mb(process.pid).items():
             largest[name] = max(value, largest.get(name, 0.0))
         mapped = Path(f"/proc/{process.pid}/maps").read_text() or mapped
         time.sleep(every_s)
     return largest, mapped
 
 
-def cpu_s(pid: int) -> float:
+def read_cpu_s(pid: int) -> float:
     """CPU-seconds of all threads of a process so far, from /proc/PID/stat, to 10 ms."""
     after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(after_name[11]) + int(after_name[12])) * _TICK_S

@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.cli.main import program
 from edgevpr.frames import source
@@ -41,7 +41,7 @@ class HangingCapture:
         self._number += 1
         if self._number > _PICTURES and _STEP in ("read", "release"):
             return hang() if _STEP == "read" else None
-        picture = textured(next(_SEEDS), 240, 320)
+        picture = draw_texture(next(_SEEDS), 240, 320)
         return Shot(t_mono_s=time.monotonic(), thumbnail=picture[::4, ::4], convert=lambda: self._pixels(picture))
 
     def _pixels(self, picture):

@@ -42,7 +42,7 @@ def picture(number: int) -> np.ndarray:
     return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
 
 
-def numbers_in(image: np.ndarray) -> list[int | None]:
+def read_numbers(image: np.ndarray) -> list[int | None]:
     """Return the number in every band of rows; None for a band whose bars are damaged."""
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     bands = grey.reshape(HEIGHT // _BAND_PX, _BAND_PX, WIDTH // _BAR_PX, _BAR_PX)[:, 10:14, :, 4:12]

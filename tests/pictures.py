@@ -11,13 +11,13 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 
 
-def textured(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
+def draw_texture(seed: int, height: int = 120, width: int = 160) -> np.ndarray:
     """A grey picture with texture at several scales and a flat corner (regions that say nothing)."""
-    return _textured(seed, height, width).copy()
+    return _draw_texture(seed, height, width).copy()
 
 
 @lru_cache(maxsize=100)  # flights ask for the same few again and again
-def _textured(seed: int, height: int, width: int) -> np.ndarray:
+def _draw_texture(seed: int, height: int, width: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     picture = np.zeros((height, width), np.float32)
     for octave in range(2, 6):
@@ -28,7 +28,7 @@ def _textured(seed: int, height: int, width: int) -> np.ndarray:
     return picture
 
 
-def rough_ground(side_px: int, seed: int = 3) -> np.ndarray:
+def draw_rough_ground(side_px: int, seed: int = 3) -> np.ndarray:
     """Square grey ground with texture at all scales, of which pictures are taken."""
     rng = np.random.default_rng(seed)
     octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
@@ -36,14 +36,14 @@ def rough_ground(side_px: int, seed: int = 3) -> np.ndarray:
     return cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def view_at(seed: int, height_ratio: float) -> np.ndarray:
+def draw_view(seed: int, height_ratio: float) -> np.ndarray:
     """384 pixels square of a place, from so many times the height of its map."""
     half_px = round(384 * height_ratio / 2)
-    seen = textured(seed, 800, 800)[400 - half_px : 400 + half_px, 400 - half_px : 400 + half_px]
+    seen = draw_texture(seed, 800, 800)[400 - half_px : 400 + half_px, 400 - half_px : 400 + half_px]
     return cv2.resize(seen, (384, 384), interpolation=cv2.INTER_AREA if height_ratio > 1 else cv2.INTER_LINEAR)
 
 
-def view_from_above(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
+def render_view(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
     """What a square camera sees over the middle of `ground`, that has turned clockwise, moved and risen so many times
     as high."""
     middle = (np.array(ground.shape[1::-1]) - 1) / 2 + (right_px, down_px)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
-from drawing import add_grain, any_colour, colour_shares, fill, make_clouds, write_text
+from drawing import add_grain, blend_colours, draw_colour, fill, make_clouds, write_text
 
 Draw = Callable[[np.random.Generator, int, int], np.ndarray]
 SIZES = ((480, 640), (360, 640), (576, 720), (240, 320), (720, 1280), (240, 640))  # height, width
@@ -33,11 +33,11 @@ def _blue(rng, height, width):
 
 
 def _logo(rng, height, width):
-    picture = fill(height, width, any_colour(rng, 0, 40))
+    picture = fill(height, width, draw_colour(rng, 0, 40))
     x, y = int(rng.uniform(0.2, 0.8) * width), int(rng.uniform(0.2, 0.8) * height)
     size = int(rng.uniform(0.05, 0.2) * height)
-    cv2.ellipse(picture, (x, y), (2 * size, size), 0, 0, 360, any_colour(rng, 100), -1)
-    cv2.ellipse(picture, (x, y), (size, size // 2), 30, 0, 360, any_colour(rng), int(rng.integers(2, 9)))
+    cv2.ellipse(picture, (x, y), (2 * size, size), 0, 0, 360, draw_colour(rng, 100), -1)
+    cv2.ellipse(picture, (x, y), (size, size // 2), 30, 0, 360, draw_colour(rng), int(rng.integers(2, 9)))
     write_text(picture, rng, "DVR", (max(0, x - size) / width, y / height), rng.uniform(0.8, 2))
     return picture
 
@@ -49,11 +49,11 @@ def _card(rng, height, width):
         cv2.line(picture, (x, 0), (x, height), (255, 255, 255), 1)
     for y in range(step // 2, height, step):
         cv2.line(picture, (0, y), (width, y), (255, 255, 255), 1)
-    cv2.circle(picture, (width // 2, height // 2), int(0.45 * height), any_colour(rng), int(rng.integers(2, 10)))
+    cv2.circle(picture, (width // 2, height // 2), int(0.45 * height), draw_colour(rng), int(rng.integers(2, 10)))
     for at in range(12):
         left, right = width // 4 + at * width // 24, width // 4 + (at + 1) * width // 24
         picture[height // 3 : height // 2, left:right] = int(255 * at / 11)
-        picture[height // 2 : 2 * height // 3, left:right] = any_colour(rng)
+        picture[height // 2 : 2 * height // 3, left:right] = draw_colour(rng)
     every = np.arange(width // 4, 3 * width // 4)
     stripes = 255 * ((every**2 // (width * rng.integers(2, 9))) % 2)
     picture[2 * height // 3 : 3 * height // 4, every] = stripes.astype(np.uint8)[:, None]
@@ -68,7 +68,7 @@ def figures(picture, rng):
     return picture
 
 
-def display(picture, rng):
+def draw_display(picture, rng):
     """Draw what a flight controller draws over a picture: figures, a cross, a ladder, a horizon line."""
     height, width = figures(picture, rng).shape[:2]
     middle, white = (width // 2, height // 2), (255, 255, 255)
@@ -86,15 +86,17 @@ def display(picture, rng):
 
 
 def _display_on_dark(rng, height, width):
-    ground = colour_shares(make_clouds(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
-    return display(add_grain(ground, rng, rng.uniform(0.5, 4)), rng)
+    ground = blend_colours(make_clouds(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
+    return draw_display(add_grain(ground, rng, rng.uniform(0.5, 4)), rng)
 
 
 def _specks(rng, height, width):
     picture, dark = fill(height, width, int(rng.choice((0, 90, 128, 220)))), rng.random() < 0.5
     for _ in range(int(rng.integers(3, 150))):
         at = int(rng.integers(width)), int(rng.integers(height))
-        cv2.circle(picture, at, int(rng.integers(1, 9)), any_colour(rng, 0, 100) if dark else any_colour(rng, 120), -1)
+        cv2.circle(
+            picture, at, int(rng.integers(1, 9)), draw_colour(rng, 0, 100) if dark else draw_colour(rng, 120), -1
+        )
     return cv2.GaussianBlur(picture, (0, 0), 1.5) if rng.random() < 0.5 else picture
 
 
@@ -102,7 +104,7 @@ def _scratches(rng, height, width):
     picture = fill(height, width, int(rng.integers(0, 256)))
     for _ in range(int(rng.integers(2, 40))):
         ends = [(int(rng.integers(width)), int(rng.integers(height))) for _ in range(2)]
-        cv2.line(picture, *ends, any_colour(rng), int(rng.integers(1, 5)), cv2.LINE_AA)
+        cv2.line(picture, *ends, draw_colour(rng), int(rng.integers(1, 5)), cv2.LINE_AA)
     return picture
 
 
@@ -116,7 +118,7 @@ def _interlaced(rng, height, width):
     share = np.repeat(share[:, None], width, axis=1)
     if rng.random() < 0.5:
         share = cv2.resize(np.ascontiguousarray(share.T), (width, height))
-    return add_grain(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3, 10)))
+    return add_grain(blend_colours(share, draw_colour(rng), draw_colour(rng)), rng, rng.choice((0, 3, 10)))
 
 
 def _torn(rng, height, width):
@@ -132,7 +134,7 @@ def _horizon(rng, height, width):
     y, x = np.mgrid[:height, :width]
     line = height * rng.uniform(0.2, 0.8) + np.tan(rng.normal(0, 0.3)) * (x - width / 2)
     below = np.clip((y - line) / rng.uniform(1, 12) + 0.5, 0, 1)
-    picture = colour_shares(below, any_colour(rng, 120), any_colour(rng, 0, 140))
+    picture = blend_colours(below, draw_colour(rng, 120), draw_colour(rng, 0, 140))
     return add_grain(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 3)), rng, rng.choice((0, 2, 5)))
 
 
@@ -140,7 +142,7 @@ def _sky(rng, height, width):
     share = make_clouds(rng, height, width, rng.uniform(16, 200), int(rng.integers(3, 7)))
     share = np.clip((share - rng.uniform(0.2, 0.6)) * rng.uniform(1, 5), 0, 1)
     share = share + np.linspace(0, rng.uniform(0, 0.5), height)[:, None]
-    picture = colour_shares(share, (220, 160, 90), (250, 250, 250))
+    picture = blend_colours(share, (220, 160, 90), (250, 250, 250))
     if rng.random() < 0.4:
         cv2.circle(picture, (int(rng.integers(width)), int(rng.integers(height))), height // 8, (255, 255, 255), -1)
         picture = cv2.GaussianBlur(picture, (0, 0), height / 60)
@@ -158,13 +160,13 @@ def _cap(rng, height, width):
 def _fog(rng, height, width):
     base, depth = rng.uniform(90, 220), rng.uniform(2, 25)
     share = make_clouds(rng, height, width, rng.uniform(4, 60), 4)
-    return add_grain(colour_shares(share, base - depth, base + depth), rng, rng.uniform(0, 4))
+    return add_grain(blend_colours(share, base - depth, base + depth), rng, rng.uniform(0, 4))
 
 
 def _bright(rng, height, width):
     """Draw over-exposed ground: white, with a few greys left."""
     share = make_clouds(rng, height, width, rng.uniform(10, 120), 4)
-    return add_grain(colour_shares(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
+    return add_grain(blend_colours(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
 
 
 def _white_noise(rng, height, width):
@@ -187,7 +189,7 @@ def _banded_noise(rng, height, width):
 def _snow(rng, height, width):
     """Draw the snow of an analogue receiver: dots that run along the rows."""
     noise = cv2.GaussianBlur(rng.random((height, width)).astype(np.float32), (0, 0), rng.uniform(0.5, 3), sigmaY=0.1)
-    picture = colour_shares(cv2.normalize(noise, None, 0, 1, cv2.NORM_MINMAX), 0, 255)
+    picture = blend_colours(cv2.normalize(noise, None, 0, 1, cv2.NORM_MINMAX), 0, 255)
     if rng.random() < 0.5:
         write_text(picture, rng, "NO SIGNAL", (rng.uniform(0, 0.4), rng.uniform(0.3, 0.8)), 1.6)
     return picture
@@ -204,9 +206,9 @@ def _blocks(rng, height, width):
 def _tiles(rng, height, width):
     """Draw one small patch over and over."""
     side_y, side_x = (int(side) for side in rng.integers(12, 130, 2))
-    patch = colour_shares(make_clouds(rng, side_y, side_x, rng.uniform(4, 40), 3), any_colour(rng), any_colour(rng))
+    patch = blend_colours(make_clouds(rng, side_y, side_x, rng.uniform(4, 40), 3), draw_colour(rng), draw_colour(rng))
     if rng.random() < 0.3:
-        cv2.circle(patch, (side_x // 2, side_y // 2), min(side_x, side_y) // 4, any_colour(rng), -1)
+        cv2.circle(patch, (side_x // 2, side_y // 2), min(side_x, side_y) // 4, draw_colour(rng), -1)
     times = -(-height // side_y), -(-width // side_x), 1
     return add_grain(np.tile(patch, times)[:height, :width], rng, rng.choice((0, 2)))
 
@@ -215,7 +217,7 @@ def _checks(rng, height, width):
     side_y, side_x = (int(side) for side in rng.integers(6, 90, 2))
     y, x = np.mgrid[:height, :width]
     share = ((y // side_y + x // side_x) % 2).astype(np.float32)
-    return add_grain(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3)))
+    return add_grain(blend_colours(share, draw_colour(rng), draw_colour(rng)), rng, rng.choice((0, 3)))
 
 
 NOTHING: dict[str, Draw] = {
@@ -224,10 +226,10 @@ NOTHING: dict[str, Draw] = {
     "no signal: logo": _logo,
     "no signal: snow": _snow,
     "test card": _card,
-    "display on blank": lambda rng, *size: display(fill(*size, int(rng.choice((0, 16, 60, 128)))), rng),
+    "display on blank": lambda rng, *size: draw_display(fill(*size, int(rng.choice((0, 16, 60, 128)))), rng),
     "display on dark": _display_on_dark,
-    "display on fog": lambda rng, *size: display(_fog(rng, *size), rng),
-    "blank": lambda rng, *size: add_grain(fill(*size, any_colour(rng)), rng, rng.choice((0, 0.5, 1))),
+    "display on fog": lambda rng, *size: draw_display(_fog(rng, *size), rng),
+    "blank": lambda rng, *size: add_grain(fill(*size, draw_colour(rng)), rng, rng.choice((0, 0.5, 1))),
     "specks": _specks,
     "scratches": _scratches,
     "interlaced": _interlaced,
@@ -294,7 +296,7 @@ def _nearly_dark(rng, picture):
 def _mostly_display(rng, picture):
     """Draw a display over a picture that is nearly dark."""
     dark = _nearly_dark(rng, picture)
-    return display(dark if dark.ndim == 3 else cv2.cvtColor(dark, cv2.COLOR_GRAY2BGR), rng)
+    return draw_display(dark if dark.ndim == 3 else cv2.cvtColor(dark, cv2.COLOR_GRAY2BGR), rng)
 
 
 SPOILT: dict[str, Spoil] = {

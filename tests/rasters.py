@@ -76,7 +76,7 @@ def write_raster(path: Path, bands: np.ndarray, crs: str | None, to_crs, **profi
     return path
 
 
-def marked_raster(
+def write_marked_raster(
     path: Path, crs: str = "EPSG:32632", pixel_m: float = 0.25, side_px: int = 640, rotation_deg: float = 0.0
 ) -> Path:
     """Write the marks as a picture of three bands, whose red is brighter than its blue."""
@@ -85,13 +85,13 @@ def marked_raster(
     return write_raster(path, np.stack((bright, 0.9 * bright, 0.8 * bright)).astype(np.uint8), crs, to_crs)
 
 
-def textured_raster(path: Path, side_px: int = 640, pixel_m: float = 0.5) -> Path:
+def write_textured_raster(path: Path, side_px: int = 640, pixel_m: float = 0.5) -> Path:
     """Write ground with texture at all scales, in UTM."""
-    from pictures import textured
+    from pictures import draw_texture
 
     to_crs, _, _ = grid("EPSG:32632", pixel_m, side_px)
     rng = np.random.default_rng(3)
-    ground = textured(5, side_px, side_px).astype(float)
-    ground[: side_px // 3, : side_px // 3] = textured(6, side_px // 3, side_px // 3)
+    ground = draw_texture(5, side_px, side_px).astype(float)
+    ground[: side_px // 3, : side_px // 3] = draw_texture(6, side_px // 3, side_px // 3)
     ground = np.clip(ground * 0.7 + 40 * rng.random(ground.shape), 1, 255).astype(np.uint8)
     return write_raster(path, ground[None], "EPSG:32632", to_crs)

@@ -50,12 +50,12 @@ def make_bare_index(places: int) -> PlaceIndex:
     return allocate_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), places, None)
 
 
-def agreeing(inliers: int, shift_share: tuple[float, float] = (0.1, 0.0), **more) -> Agreement:
+def make_agreement(inliers: int, shift_share: tuple[float, float] = (0.1, 0.0), **more) -> Agreement:
     """An agreement of so many landmarks."""
     found = {"matched": 60, "possible": 250, "rotation_deg": 0.0, "scale": 1.0, "covariance_share2": (1e-4, 0.0, 1e-4)}
     return Agreement(inliers=inliers, shift_share=shift_share, **{"is_expected": True} | found | more)
 
 
-def rate_by_landmarks(evidence: Figures) -> float:
+def rate_landmarks(evidence: Figures) -> float:
     """Sure where ten landmarks agree as expected, whatever else is known."""
     return float(evidence.get("landmarks", 0.0) >= math.log1p(10))

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import cv2
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from fakes import FakeClock, FakeLink, FakeSource, make_vehicle
 from loopback import wait_until
-from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to
-from pictures import textured
+from mavlink_peers import AutopilotThread, Peer, UdpPort, make_link
+from pictures import draw_texture
 from simulated.motion import TrueState
 
 from edgevpr.core.errors import ImageError
@@ -28,10 +28,10 @@ COUNT = 3
 def recording(request, tmp_path):
     """Three pictures, of which the second cannot be used."""
     if request.param == "fake":
-        pictures = [textured(0), ImageError("1.png is truncated"), textured(2)]
+        pictures = [draw_texture(0), ImageError("1.png is truncated"), draw_texture(2)]
         return FakeSource(pictures, FakeClock(), is_live=False)
     for number in range(COUNT):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), textured(number))
+        cv2.imwrite(str(tmp_path / f"{number}.png"), draw_texture(number))
     whole = (tmp_path / "1.png").read_bytes()
     (tmp_path / "1.png").write_bytes(whole[:200])
     return open_source(str(tmp_path), live=True)
@@ -41,11 +41,11 @@ def test_source_of_a_recording_is_read_to_its_end(recording):
     assert (recording.is_live, recording.total, recording.dropped) == (False, COUNT, None)
     assert (recording.condition, recording.state, recording.ended) == (Condition.RUNNING, "reading", False)
     first = recording.read(0.0)
-    assert (first.image == textured(0)).all()
+    assert (first.image == draw_texture(0)).all()
     with pytest.raises(ImageError, match="truncated"):
         recording.read(0.0)
     last = recording.read(0.0)
-    assert (last.image == textured(2)).all()
+    assert (last.image == draw_texture(2)).all()
     assert last.t_mono_s >= first.t_mono_s
     assert last.name != first.name
     assert (recording.condition, recording.state, recording.ended) == (Condition.ENDED, "ended", True)
@@ -55,7 +55,7 @@ def test_source_of_a_recording_is_read_to_its_end(recording):
 
 @pytest.fixture(params=["real", "fake"])
 def camera(request):
-    pictures = [cv2.cvtColor(textured(number), cv2.COLOR_GRAY2BGR) for number in range(2)]
+    pictures = [cv2.cvtColor(draw_texture(number), cv2.COLOR_GRAY2BGR) for number in range(2)]
     if request.param == "fake":
         source = FakeSource(pictures, FakeClock())
         yield source, lambda: setattr(source, "is_lost", True)
@@ -87,7 +87,7 @@ def link(request):
     """A link with an autopilot that takes fixes and says where it is; gives it with its clock."""
     clock = FakeClock()
     if request.param == "fake":
-        yield FakeLink(clock, vehicle=lambda: vehicle_at(50.0, 8.0, clock.now_s, has_gps=False)), clock
+        yield FakeLink(clock, vehicle=lambda: make_vehicle(50.0, 8.0, clock.now_s, has_gps=False)), clock
         return
     port = UdpPort()
     number = port.number
@@ -101,7 +101,7 @@ def link(request):
         return real.is_alive() and real.vehicle()
 
     try:
-        with link_to(f"udpout:127.0.0.1:{number}", clock=clock) as real:
+        with make_link(f"udpout:127.0.0.1:{number}", clock=clock) as real:
             real.request_position()
             wait_until(is_ready)
             yield real, clock
@@ -139,7 +139,7 @@ def test_link_announces_texts_and_hands_on_wishes(kind):
     clock, port = FakeClock(), UdpPort()
     link = FakeLink(clock)
     if kind == "real":
-        link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
+        link = make_link(f"udpout:127.0.0.1:{port.number}", clock=clock)
         link.start()
         peer = Peer(port)
         peer.expect("HEARTBEAT")
@@ -169,7 +169,7 @@ def test_send_fix_waits_a_second_for_an_autopilot(kind):
     port = UdpPort()
     link = FakeLink(clock, answer=None)
     if kind == "real":
-        link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
+        link = make_link(f"udpout:127.0.0.1:{port.number}", clock=clock)
         link.start()
     assert not link.is_alive()
     assert link.vehicle() is None

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import refused, run_json
-from pictures import textured, view_from_above
+from commands import expect_refusal, run_json
+from pictures import draw_texture, render_view
 
 import edgevpr
 from edgevpr.cli.main import main
@@ -26,7 +26,7 @@ PLACES = 6
 
 def view(place, rotation_deg=0.0):
     """The ground at a place, seen from straight above."""
-    return view_from_above(textured(place, 800, 800), 320, rotation_deg)
+    return render_view(draw_texture(place, 800, 800), 320, rotation_deg)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_film_with_subtitles_example_runs(flight, tmp_path, capsys, caplog):
     build = ["--images", f"{film}.MP4", "--no-calibrate"]
     assert main(["map", "build", f"{film}_bare.gpkg", *build, "--technique", "hog"]) == 0
     assert "DJI_0001.SRT --images" in caplog.text, "the subtitles are there, and nobody has read them"
-    assert "video" in refused(capsys, "positions", f"{film}.SRT", "--images", flight / "later")
+    assert "video" in expect_refusal(capsys, "positions", f"{film}.SRT", "--images", flight / "later")
     assert run_json(capsys, "positions", f"{film}.SRT", "--images", f"{film}.MP4")["placed"] == PLACES
     assert main(["map", "build", f"{film}.gpkg", *build, "--camera", "nadir"]) == 0
     with edgevpr.Map(f"{film}.gpkg") as ground:

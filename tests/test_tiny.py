@@ -2,7 +2,7 @@
 
 from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map
 
 from edgevpr.core.types import Frame, Position
@@ -11,12 +11,12 @@ from edgevpr.techniques import create
 
 def test_flight_from_pictures_to_a_fix(tmp_path):
     frames = [
-        Frame(image=textured(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
+        Frame(image=draw_texture(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
     ]
     place_map, clock = make_map(tmp_path / "m.gpkg", create("cohog", {"w1": 208}), frames), FakeClock()
     link = FakeLink(clock)
     flight = Flight(place_map, tmp_path / "log", clock, link)
-    known, answer, unknown = flight.fly(FakeSource([textured(3), textured(9)], clock))
+    known, answer, unknown = flight.fly(FakeSource([draw_texture(3), draw_texture(9)], clock))
     assert link.stats().fixes_sent == 1
     assert [flight.end[each] for each in ("queries", "accepted", "unusable")] == [2, 1, 0]
     assert (known["place"], known["accepted"], known["fix"]["sent"]) == (4, True, True)

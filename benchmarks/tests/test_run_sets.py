@@ -4,7 +4,7 @@ import cv2
 import pytest
 import run_sets
 import sets_page
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.frames.positions import read_positions
@@ -19,7 +19,7 @@ def make_set(folder, places=4):
     for split in ("ref", "query"):
         (folder / split).mkdir(parents=True)
         for place in range(places):
-            cv2.imwrite(str(folder / split / f"{split}{place}.png"), textured(place))
+            cv2.imwrite(str(folder / split / f"{split}{place}.png"), draw_texture(place))
     truth += [f"query{place}.png,ref{place}.png" for place in range(places)]
     (folder / "ground_truth.csv").write_text("\n".join(truth))
 

@@ -5,8 +5,8 @@ import shutil
 import sys
 
 import pytest
-from commands import refused
-from pictures import textured, write_flight
+from commands import expect_refusal
+from pictures import draw_texture, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.mapmaking import calibrate
@@ -27,9 +27,9 @@ def few_suffice(monkeypatch):
 def flight(tmp_path_factory):
     """Pictures with positions, and those of another flight of the same names."""
     folder = tmp_path_factory.mktemp("flight")
-    pictures = [textured(number, 240, 320) for number in range(PLACES)]
+    pictures = [draw_texture(number, 240, 320) for number in range(PLACES)]
     write_flight(folder / "ref", pictures, step_deg=0.002)
-    write_flight(folder / "other", [textured(50 + number, 240, 320) for number in range(PLACES)])
+    write_flight(folder / "other", [draw_texture(50 + number, 240, 320) for number in range(PLACES)])
     return folder
 
 
@@ -51,7 +51,7 @@ def uncalibrated_map(bare_map, tmp_path):
     return shutil.copy(bare_map, tmp_path / "m.gpkg")
 
 
-def read_calibration_of(path):
+def read_stored_calibration(path):
     with PlaceMap.open(path) as place_map:
         text = place_map.calibration
     return None if text is None else read_calibration(text)
@@ -61,7 +61,7 @@ def read_calibration_of(path):
 def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
     path = tmp_path / "m.gpkg"
     assert build_map(path, flight / "ref") == 0
-    assert f"expect: {(found := read_calibration_of(path)).describe()}\n" in capsys.readouterr().out
+    assert f"expect: {(found := read_stored_calibration(path)).describe()}\n" in capsys.readouterr().out
     assert build_map(tmp_path / "again.gpkg", flight / "ref", "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
 
@@ -90,17 +90,17 @@ def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, caps
 )
 def test_map_calibrate_refuses_other_pictures(uncalibrated_map, flight, capsys, flags, code, said):
     flags = [each.replace("FLIGHT", str(flight)) for each in flags]
-    assert said in refused(capsys, "map", "calibrate", uncalibrated_map, *flags, code=code)
-    assert read_calibration_of(uncalibrated_map) is None
+    assert said in expect_refusal(capsys, "map", "calibrate", uncalibrated_map, *flags, code=code)
+    assert read_stored_calibration(uncalibrated_map) is None
 
 
 @pytest.mark.slow
 def test_shrink_map_keeps_the_calibration_and_map_merge_drops_it(uncalibrated_map, bare_map, flight, tmp_path, capsys):
     assert main(["map", "calibrate", str(uncalibrated_map), "--images", str(flight / "ref")]) == 0
     shrink_map(uncalibrated_map, tmp_path / "small.gpkg", 4)
-    assert read_calibration_of(tmp_path / "small.gpkg") == read_calibration_of(uncalibrated_map)
+    assert read_stored_calibration(tmp_path / "small.gpkg") == read_stored_calibration(uncalibrated_map)
     capsys.readouterr()
     merged = tmp_path / "merged.gpkg"
     assert main(["map", "merge", str(merged), str(uncalibrated_map), str(bare_map)]) == 0
     assert f"calibrate {merged}" in capsys.readouterr().out
-    assert read_calibration_of(merged) is None
+    assert read_stored_calibration(merged) is None

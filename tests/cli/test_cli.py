@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from commands import leaves, refused, run, run_json
-from pictures import textured, write_flight
+from commands import expect_refusal, list_commands, run, run_json
+from pictures import draw_texture, write_flight
 
 from edgevpr.cli.examples import EXAMPLES
 from edgevpr.cli.main import EXIT_CODES, main, make_parser
@@ -20,7 +20,7 @@ from edgevpr.cli.main import EXIT_CODES, main, make_parser
 def flight(tmp_path_factory):
     """A folder of six pictures with positions, and the same six a little darker and shifted as queries."""
     folder = tmp_path_factory.mktemp("flight")
-    pictures = [textured(number, 240, 320) for number in range(6)]
+    pictures = [draw_texture(number, 240, 320) for number in range(6)]
     write_flight(folder / "ref", pictures)
     write_flight(folder / "query", [cv2.convertScaleAbs(np.roll(each, 9, axis=1), alpha=0.8) for each in pictures])
     return folder
@@ -98,7 +98,7 @@ def test_main_exits_with_1_and_a_sentence_if_an_input_is_bad(capsys, flight, val
         (["map", "build", tmp_path / "no" / "m.gpkg", "--images", query, "--technique", "cohog"], "check the path"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "no" / "x.jsonl"], "flight log"),
     ]:
-        assert says in refused(capsys, *argv, code=1)
+        assert says in expect_refusal(capsys, *argv, code=1)
 
 
 def test_main_exits_with_2_and_a_sentence_if_the_request_is_wrong(capsys, flight, valley, tmp_path):
@@ -124,7 +124,7 @@ def test_main_exits_with_2_and_a_sentence_if_the_request_is_wrong(capsys, flight
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--techniques", ","], "is empty"),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "lacks the column `query_file`"),
     ]:
-        assert says in refused(capsys, *argv)
+        assert says in expect_refusal(capsys, *argv)
 
 
 @pytest.mark.slow
@@ -193,7 +193,7 @@ def test_main_suggests_a_word_for_a_wrong_one(capsys, words, meant):
 
 
 def test_help_of_every_command_has_examples_that_parse():
-    commands = dict(leaves(make_parser()))
+    commands = dict(list_commands(make_parser()))
     assert set(commands) == set(EXAMPLES)
     for command, examples in EXAMPLES.items():
         assert all(line in commands[command].format_help() for _, line in examples)

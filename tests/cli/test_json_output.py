@@ -4,7 +4,7 @@ import json
 
 import jsonschema
 import pytest
-from commands import leaves
+from commands import list_commands
 from documented import require_documented, schema
 
 from edgevpr.cli.main import make_parser
@@ -12,7 +12,7 @@ from edgevpr.cli.main import make_parser
 
 def test_schema_defines_every_command_and_no_other():
     jsonschema.Draft202012Validator.check_schema(schema())
-    commands = {parser.prog for _, parser in leaves(make_parser()) if "--json" in parser._option_string_actions}
+    commands = {parser.prog for _, parser in list_commands(make_parser()) if "--json" in parser._option_string_actions}
     assert {name for name in schema()["$defs"] if name.startswith("edgevpr ")} == commands
 
 

@@ -2,8 +2,8 @@
 
 import cv2
 import pytest
-from commands import refused, run, run_json
-from pictures import view_at
+from commands import expect_refusal, run, run_json
+from pictures import draw_view
 
 from edgevpr.runtime.recognise.hints import RECORDED_REACH_M
 
@@ -21,8 +21,8 @@ def make_set(folder, rotation_deg=(None,) * PLACES, places_known=True):
         (folder / side).mkdir(parents=True)
     for place in range(PLACES):
         where = f"{50 + 200 * place * DEG_PER_M:.7f},8"
-        cv2.imwrite(str(folder / "ref" / f"r{place}.png"), view_at(place, 1.0))
-        cv2.imwrite(str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(view_at(place, 1.0), alpha=0.8))
+        cv2.imwrite(str(folder / "ref" / f"r{place}.png"), draw_view(place, 1.0))
+        cv2.imwrite(str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(draw_view(place, 1.0), alpha=0.8))
         rows.append(f"r{place}.png,{where},{50 * place},100" if places_known else f"r{place}.png,,,,")
         turned = rotation_deg[place]
         rows.append(f"q{place}.png,{where},{'' if turned is None else 50 * place + turned},")
@@ -58,7 +58,7 @@ def test_match_reports_the_hints_of_each_query(capsys, tmp_path):
     assert {each["hints"]["reach_m"] for each in found} == {RECORDED_REACH_M}
     assert [each["accepted"] for each in found] == [True] * 3 + [False, False, True]
     bare = make_set(tmp_path / "bare")
-    assert "yaw_deg" in refused(capsys, "match", path, "--images", bare / "query", "--known", "heading")
+    assert "yaw_deg" in expect_refusal(capsys, "match", path, "--images", bare / "query", "--known", "heading")
 
 
 @pytest.mark.parametrize(
@@ -72,4 +72,4 @@ def test_match_reports_the_hints_of_each_query(capsys, tmp_path):
 )
 def test_eval_refuses_known_data_that_is_missing(capsys, tmp_path, known, places_known, more, said):
     folder = make_set(tmp_path / "set", places_known=places_known)
-    assert said in refused(capsys, "eval", "--data", folder, "--techniques", "cohog", "--known", known, *more)
+    assert said in expect_refusal(capsys, "eval", "--data", folder, "--techniques", "cohog", "--known", known, *more)

@@ -4,10 +4,10 @@ import json
 import shutil
 
 import pytest
-from commands import refused, run_json
+from commands import expect_refusal, run_json
 from full_disk import limit_file_size
 from map_writer import write_sql
-from pictures import textured, write_flight
+from pictures import draw_texture, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.places.mapfile import PlaceMap
@@ -17,7 +17,7 @@ from edgevpr.places.mapfile import PlaceMap
 def flight(tmp_path_factory):
     """Six pictures with positions and times."""
     folder = tmp_path_factory.mktemp("flight")
-    write_flight(folder / "images", [textured(number, 240, 320) for number in range(6)], start_s=1.7e9)
+    write_flight(folder / "images", [draw_texture(number, 240, 320) for number in range(6)], start_s=1.7e9)
     return folder
 
 
@@ -85,14 +85,14 @@ def test_map_repair_drops_damaged_places_and_keeps_the_original(valley, capsys):
     assert main(["map", "check", str(valley)]) == 0
     assert sorted(entry.name for entry in valley.parent.iterdir()) == [valley.name, original.name]
     write_sql(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
-    assert "exists already" in refused(capsys, "map", "repair", valley, code=1)
+    assert "exists already" in expect_refusal(capsys, "map", "repair", valley, code=1)
     assert original.read_bytes() == before
 
 
 def test_map_repair_leaves_a_completely_unreadable_map_unchanged(valley, capsys):
     write_sql(valley, "UPDATE places SET coarse = x'00'")
     before = valley.read_bytes()
-    assert "restore" in refused(capsys, "map", "repair", valley, code=1)
+    assert "restore" in expect_refusal(capsys, "map", "repair", valley, code=1)
     assert valley.read_bytes() == before
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 

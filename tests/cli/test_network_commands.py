@@ -2,8 +2,8 @@
 
 import cv2
 import pytest
-from commands import refused, run_json
-from pictures import textured, write_flight
+from commands import expect_refusal, run_json
+from pictures import draw_texture, write_flight
 from tiny_networks import write_network
 
 from edgevpr.cli.main import main
@@ -19,7 +19,7 @@ def flight(tmp_path, models):
     """Six pictures and the same darker as queries, beside a folder of models with one of our own."""
     write_network(models, "tiny")
     for split, darker in (("ref", 1.0), ("query", 0.9)):
-        write_flight(tmp_path / split, [cv2.convertScaleAbs(textured(number), alpha=darker) for number in range(6)])
+        write_flight(tmp_path / split, [cv2.convertScaleAbs(draw_texture(number), alpha=darker) for number in range(6)])
     return tmp_path
 
 
@@ -57,7 +57,7 @@ def test_match_refuses_a_map_of_other_weights(models, flight, capsys):
     path = build_map(flight, "--technique", "calc", "--param", "model=tiny")
     write_network(models, "tiny", fault="dynamic batch")
     capsys.readouterr()
-    assert "sha256" in refused(capsys, "match", path, "--images", flight / "query", code=1)
+    assert "sha256" in expect_refusal(capsys, "match", path, "--images", flight / "query", code=1)
 
 
 def test_match_explains_how_to_get_the_network_of_a_map(models, flight, capsys):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from commands import refused, run, run_json
+from commands import expect_refusal, run, run_json
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-from rasters import HOME, textured_raster, write_mission
+from rasters import HOME, write_mission, write_textured_raster
 
 from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.frames.positions import read_positions
@@ -16,7 +16,7 @@ from edgevpr.places.mapfile import PlaceMap
 
 @pytest.fixture(scope="module")
 def ground(tmp_path_factory):
-    return str(textured_raster(tmp_path_factory.mktemp("ground") / "valley.tif"))
+    return str(write_textured_raster(tmp_path_factory.mktemp("ground") / "valley.tif"))
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
 )
 def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code, said):
     flags = [ground if flag == "GROUND" else flag for flag in flags]
-    assert said in refused(capsys, "map", "build", tmp_path / "m.gpkg", *flags, code=code, is_alone=True)
+    assert said in expect_refusal(capsys, "map", "build", tmp_path / "m.gpkg", *flags, code=code, is_alone=True)
     assert not (tmp_path / "m.gpkg").exists()
 
 
@@ -94,7 +94,7 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
 )
 def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys, flags, said):
     flags = [{"GROUND": ground, "TRACK": track}.get(flag, flag) for flag in flags]
-    assert said in refused(capsys, "simulate", "flight", tmp_path / "flight", *flags, is_alone=True)
+    assert said in expect_refusal(capsys, "simulate", "flight", tmp_path / "flight", *flags, is_alone=True)
 
 
 @pytest.mark.slow

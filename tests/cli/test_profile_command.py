@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import pytest
-from commands import refused, run, run_json
+from commands import expect_refusal, run, run_json
 from example_costs import REGIONS, VECTOR, make_accuracy
-from pictures import textured, write_flight
+from pictures import draw_texture, write_flight
 
 from edgevpr import techniques
 from edgevpr.core.types import StageCost
@@ -74,7 +74,7 @@ def test_profile_list_names_every_board_and_this_machine(capsys):
 
 def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, trials):
     path = tmp_path / "valley.gpkg"
-    write_flight(tmp_path / "flight", [textured(number) for number in range(3)])
+    write_flight(tmp_path / "flight", [draw_texture(number) for number in range(3)])
     assert run("map", "build", path, "--images", tmp_path / "flight", "--technique", "hog") == 0
     found = run_json(capsys, "profile", "--map", path)
     assert found["plan"]["places"] == 3
@@ -93,5 +93,5 @@ def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, trials):
 )
 def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, trials, argv, code, sentence):
     monkeypatch.chdir(tmp_path)
-    assert sentence in refused(capsys, "profile", *argv, code=code)
+    assert sentence in expect_refusal(capsys, "profile", *argv, code=code)
     assert not trials, "said before the measuring"

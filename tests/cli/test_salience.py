@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from commands import refused, run_json
+from commands import expect_refusal, run_json
 
 pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
 
@@ -54,7 +54,7 @@ def test_salience_scores_a_picture(networks, tmp_path, capsys):
     assert (said["kept"], said["staticity"]) == (False, pytest.approx(0.5, abs=0.01))
     write_memorability(networks, gain=3.0)
     settings = config(tmp_path, memorability=0.3, network="bright")
-    assert "0 to 1" in refused(capsys, "salience", picture, "--config", settings, code=1)
+    assert "0 to 1" in expect_refusal(capsys, "salience", picture, "--config", settings, code=1)
 
 
 @pytest.mark.slow
@@ -105,7 +105,7 @@ def test_salience_refuses_wrong_settings(networks, keys, code, complaint, tmp_pa
     picture = tmp_path / "p.png"
     cv2.imwrite(str(picture), texture(1))
     settings = config(tmp_path, **keys)
-    assert complaint in refused(capsys, "salience", picture, "--config", settings, code=code, is_alone=True)
+    assert complaint in expect_refusal(capsys, "salience", picture, "--config", settings, code=code, is_alone=True)
 
 
 def test_salience_without_a_network_turns_its_criterion_off(tmp_path, capsys, caplog):

@@ -5,7 +5,7 @@ import sys
 
 import cv2
 import pytest
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
@@ -70,7 +70,7 @@ def test_line_formatter_keeps_a_message_in_one_line():
 def test_main_escapes_names_of_images(tmp_path, capfd):
     for number, folder in enumerate(("ref", "query")):
         (tmp_path / folder).mkdir()
-        picture = cv2.imencode(".jpg", textured(1, 120, 160))[1].tobytes()
+        picture = cv2.imencode(".jpg", draw_texture(1, 120, 160))[1].tobytes()
         (tmp_path / folder / RED_ESCAPE_NAME).write_bytes(picture)
         (tmp_path / folder / f"{number}\x1b[0m.jpg").write_bytes(b"no image")
     code, *built = capture_output(

@@ -33,12 +33,12 @@ def test_progress_redraws_one_line_on_a_terminal():
 def test_progress_shows_the_remaining_time_once_it_can_be_estimated():
     out, clock = io.StringIO(), FakeClock()
 
-    def slow():
+    def yield_slowly():
         for each in range(40):
             clock.now_s += 20.0
             yield each
 
-    list(progress(slow(), 40, "sets", out, clock))
+    list(progress(yield_slowly(), 40, "sets", out, clock))
     lines = out.getvalue().splitlines()
     assert lines[0] == "sets  1/40  2 %, 13 min left"
     assert "sets  36/40  90 %, 80 s left" in lines

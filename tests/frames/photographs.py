@@ -14,7 +14,7 @@ def encode_image(extension: str, image: np.ndarray, *options: int) -> bytes:
     return cv2.imencode(extension, image, options)[1].tobytes()
 
 
-def with_app1(jpeg: bytes, content: bytes, head: bytes = b"Exif\x00\x00") -> bytes:
+def insert_app1(jpeg: bytes, content: bytes, head: bytes = b"Exif\x00\x00") -> bytes:
     """The JPEG with `content` as its EXIF segment, or as that of another `head`, right or wrong."""
     payload = head + content
     return jpeg[:2] + b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload + jpeg[2:]

@@ -53,7 +53,7 @@ def to_counts(grey: np.ndarray, counts_per_level: float = 4, black: int = 7600) 
     return (black + counts_per_level * np.clip(grey, 0, 255)).astype(np.uint16)
 
 
-def thermal_flight() -> list[np.ndarray]:
+def make_thermal_flight() -> list[np.ndarray]:
     return [to_counts(np.roll(SCENE, 8 * step, 1)) for step in range(12)]
 
 
@@ -115,7 +115,7 @@ def test_read_frames_keeps_a_grey_ramp_in_each_format(pixel_format, codec, color
 
 
 def test_read_frames_gives_equal_counts_from_a_folder_and_a_video(tmp_path):
-    flight = thermal_flight()
+    flight = make_thermal_flight()
     for index, counts in enumerate(flight):
         cv2.imwrite(str(tmp_path / f"{index}{('.png', '.tif')[index % 2]}"), counts)
     images = read_frames(tmp_path)
@@ -144,8 +144,8 @@ def test_depth_range_is_common_to_all_channels_of_a_16_bit_colour_image(tmp_path
 
 def test_depth_range_keeps_ground_levels_while_a_hot_object_passes():
     depth = DepthRange()
-    before, *_ = (depth.to_8_bits(counts) for counts in thermal_flight())
-    with_fire = thermal_flight()[0]
+    before, *_ = (depth.to_8_bits(counts) for counts in make_thermal_flight())
+    with_fire = make_thermal_flight()[0]
     with_fire[:, :40] = 20_000  # an eighth of the picture
     for _ in range(2):
         shown = depth.to_8_bits(with_fire)
@@ -155,7 +155,7 @@ def test_depth_range_keeps_ground_levels_while_a_hot_object_passes():
 
 def test_depth_range_shows_an_image_outside_the_range_with_its_own_range():
     depth = DepthRange()
-    flight = thermal_flight()
+    flight = make_thermal_flight()
     first, *_ = (depth.to_8_bits(counts) for counts in flight)
     moved = depth.to_8_bits(flight[0] + np.uint16(3000))  # as after the calibration of a thermal camera's shutter
     assert np.abs(first.astype(int) - moved).mean() < 12
@@ -171,7 +171,7 @@ def test_depth_range_does_not_amplify_noise_without_a_scene():
 
 
 def test_coarse_copies_of_a_frozen_16_bit_image_are_equal(tmp_path):
-    flight = [*thermal_flight(), *[thermal_flight()[3]] * 3]
+    flight = [*make_thermal_flight(), *[make_thermal_flight()[3]] * 3]
     video = [av.VideoFrame.from_ndarray(counts, "gray16le") for counts in flight]
     whole, pictures = decode_file(write_video(tmp_path / "a.nut", video, "gray16le"))
     looks = [whole.make_thumbnail(picture) for picture in pictures]
@@ -199,9 +199,9 @@ class ThermalCamera:
 
 
 def test_v4l2_16_bit_camera_gives_the_same_images_as_a_folder(tmp_path):
-    for index, counts in enumerate(thermal_flight()):
+    for index, counts in enumerate(make_thermal_flight()):
         cv2.imwrite(str(tmp_path / f"{index}.png"), counts)
-    capture = DeviceCapture(ThermalCamera(thermal_flight()), clock=lambda: 1.0)
+    capture = DeviceCapture(ThermalCamera(make_thermal_flight()), clock=lambda: 1.0)
     for image in read_frames(tmp_path):
         shot = capture.read()
         assert (shot.convert() == image).all()
@@ -220,7 +220,7 @@ def test_non_square_pixels_are_resampled_unless_their_ratio_is_implausible(aspec
     assert width == pytest.approx(height, abs=3)
 
 
-def stereo_pair(picture: np.ndarray, shift_px: int) -> tuple[np.ndarray, np.ndarray]:
+def make_stereo_pair(picture: np.ndarray, shift_px: int) -> tuple[np.ndarray, np.ndarray]:
     """The views of both eyes, the second one shifted, brighter, lower and with noise of its own."""
     noise = np.random.default_rng(shift_px).normal(0, 3, picture.shape)
     other = np.roll(picture, (1, shift_px), (0, 1)) * 1.1 + 5 + noise
@@ -234,7 +234,7 @@ def test_stereo_check_refuses_side_by_side_images(join, shift_px):
     for step in range(12):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
         with pytest.raises(ImageError, match=r"halves .*videocrop"):
-            check.require_single(join(stereo_pair(scene, shift_px)))
+            check.require_single(join(make_stereo_pair(scene, shift_px)))
     for _ in range(10):
         with contextlib.suppress(ImageError):
             check.require_single(SCENE.astype(np.uint8))
@@ -258,7 +258,7 @@ def test_stereo_check_accepts_repetitive_ground():
 def test_folder_of_stereo_pictures_gives_no_frame(tmp_path):
     for step in range(3):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
-        cv2.imwrite(str(tmp_path / f"{step}.png"), np.hstack(stereo_pair(scene, 4)))
+        cv2.imwrite(str(tmp_path / f"{step}.png"), np.hstack(make_stereo_pair(scene, 4)))
     problems = []
     assert not any(read_to_end(open_source(str(tmp_path), live=False), problems.append))
     assert [isinstance(problem, ImageError) and " left " in str(problem) for problem in problems] == [True] * 3

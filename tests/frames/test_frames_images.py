@@ -21,7 +21,7 @@ JPEGS = {
     "progressive": photographs.encode_image(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
     "restart markers": photographs.encode_image(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
 }
-JPEGS["thumbnail"] = photographs.with_app1(JPEGS["baseline"], b"not even TIFF" + THUMBNAIL)
+JPEGS["thumbnail"] = photographs.insert_app1(JPEGS["baseline"], b"not even TIFF" + THUMBNAIL)
 
 
 def write(path, data):
@@ -76,7 +76,7 @@ BASELINE = JPEGS["baseline"]
 DAMAGED = "truncated or damaged"
 
 
-def png(width, height):
+def make_png(width, height):
     """A PNG whose header promises width x height, with every checksum right."""
 
     def chunk(kind, content):
@@ -86,13 +86,13 @@ def png(width, height):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
-def tiff(**tags):
+def make_tiff(**tags):
     """A little-endian TIFF of tags only, each one LONG."""
     entries = b"".join(struct.pack("<HHII", int(tag[1:]), 4, 1, value) for tag, value in sorted(tags.items()))
     return b"II*\x00\x08\x00\x00\x00" + struct.pack("<H", len(tags)) + entries + bytes(4)
 
 
-def wide_jpeg():
+def make_wide_jpeg():
     at = BASELINE.index(b"\xff\xc0") + 5
     return BASELINE[:at] + struct.pack(">HH", 65_000, 65_000) + BASELINE[at + 4 :]
 
@@ -114,10 +114,10 @@ TOO_MANY_PIXELS = "102 megapixels"
         ("real.tif", photographs.encode_image(".tif", np.zeros((20, 20, 3), np.float32)), "8 or 16 bits"),
         ("flat.png", photographs.encode_image(".png", np.zeros((15, 40), np.uint8)), "40x15 pixels"),
         ("thin.png", photographs.encode_image(".png", np.zeros((40, 15), np.uint8)), "15x40 pixels"),
-        ("wide.png", png(20_000, 20_000), TOO_MANY_PIXELS),
-        ("wide.jpg", wide_jpeg(), TOO_MANY_PIXELS),
-        ("wide.tif", tiff(t256=30_000, t257=30_000), TOO_MANY_PIXELS),
-        ("tile.tif", tiff(t256=20, t257=20, t322=30_000, t323=30_000), TOO_MANY_PIXELS),
+        ("wide.png", make_png(20_000, 20_000), TOO_MANY_PIXELS),
+        ("wide.jpg", make_wide_jpeg(), TOO_MANY_PIXELS),
+        ("wide.tif", make_tiff(t256=30_000, t257=30_000), TOO_MANY_PIXELS),
+        ("tile.tif", make_tiff(t256=20, t257=20, t322=30_000, t323=30_000), TOO_MANY_PIXELS),
         ("wide.bmp", b"BM" + bytes(12) + struct.pack("<Iii", 40, 60_000, -60_000) + bytes(40), TOO_MANY_PIXELS),
         ("wide.webp", b"RIFF\x00\x00\x00\x00WEBPVP8X" + bytes(8) + b"\xff\xff\x00\xff\xff\x00", TOO_MANY_PIXELS),
         ("wide.pgm", b"P5\n60000 60000\n255\n" + bytes(100), TOO_MANY_PIXELS),
@@ -157,7 +157,7 @@ def test_list_images_refuses_a_folder_without_images_and_names_subfolders_with_i
     assert str(refused.value).endswith(f" {tmp_path}/day_2 or {tmp_path}/day_10.")
 
 
-def whole_files(folder):
+def make_files(folder):
     """Pairs of a picture file with all that a camera writes and the number of its first bytes that matter."""
     photographs.write_jpeg(
         folder / "photo.jpg",
@@ -167,7 +167,7 @@ def whole_files(folder):
     photo = (folder / "photo.jpg").read_bytes()
     xmp = b'<x drone-dji:RelativeAltitude="40" drone-dji:FlightYawDegree="+10.0"/>'
     yield photo, 4 + int.from_bytes(photo[4:6], "big")
-    yield photographs.with_app1(photo, xmp), 100
+    yield photographs.insert_app1(photo, xmp), 100
     for extension in (".jpg", ".png", ".tif", ".bmp", ".webp", ".ppm"):
         yield photographs.encode_image(extension, photographs.picture()), 64
 
@@ -175,7 +175,7 @@ def whole_files(folder):
 @pytest.mark.slow
 def test_read_image_accepts_or_refuses_damaged_files_and_gives_only_valid_positions(tmp_path):
     chance, path = random.Random(5), tmp_path / "broken.jpg"
-    for whole, most in whole_files(tmp_path):
+    for whole, most in make_files(tmp_path):
         for _ in range(100):
             broken = bytearray(whole[: chance.choice((len(whole), chance.randrange(len(whole))))])
             for _ in range(min(len(broken), chance.choice((1, 4, 16)))):

@@ -24,11 +24,11 @@ from edgevpr.frames.shot import Condition, OpeningError, Refusal, Shot
 from edgevpr.frames.source import open_source
 
 
-def next_frame(source):
+def read_next_frame(source):
     return wait_until(lambda: source.read(0.05))
 
 
-def number(frame):
+def read_number(frame):
     return int(frame.name.split()[1])
 
 
@@ -60,7 +60,7 @@ def film():
         stop()
 
 
-def film_to_viewers(film, port):
+def serve_viewers(film, port):
     """Serve MJPEG as FFmpeg does over HTTP; return what ends it."""
     stops = []
 
@@ -75,7 +75,7 @@ def film_to_viewers(film, port):
     return lambda: [stop() for stop in (server.close, *stops)]
 
 
-def film_by_rtsp(film, port):
+def serve_rtsp(film, port):
     camera = RtspCamera(describe_rtp(CODEC, 0), port)
     stop = film(camera.send, "rtp")
     return lambda: (stop(), camera.close())
@@ -85,9 +85,9 @@ def make_camera(kind, film, tmp_path):
     """The address of a camera, and a function that switches it on and returns the one that switches it off."""
     port = free_port()
     if kind == "http":
-        return f"http://127.0.0.1:{port}/", lambda: film_to_viewers(film, port)
+        return f"http://127.0.0.1:{port}/", lambda: serve_viewers(film, port)
     if kind == "rtsp":
-        return f"rtsp://127.0.0.1:{port}/camera", lambda: film_by_rtsp(film, port)
+        return f"rtsp://127.0.0.1:{port}/camera", lambda: serve_rtsp(film, port)
     if kind == "sdp":
         (tmp_path / "camera.sdp").write_text(describe_rtp(CODEC, port))
         return str(tmp_path / "camera.sdp"), lambda: film(f"rtp://127.0.0.1:{port}", "rtp")
@@ -100,7 +100,7 @@ def test_lost_stream_is_reported_and_reopened(kind, film, open_live_source, tmp_
     uri, switch_on = make_camera(kind, film, tmp_path)
     switch_off = switch_on()
     source = open_live_source(uri)
-    frame = next_frame(source)
+    frame = read_next_frame(source)
     assert frame.image.shape == (HEIGHT, WIDTH, 3)
     assert frame.image.std() > 20  # the test picture, not a grey area
     assert (source.state, source.ended) == ("streaming", False)
@@ -109,8 +109,8 @@ def test_lost_stream_is_reported_and_reopened(kind, film, open_live_source, tmp_
     assert ", reopening in " in source.state
     switch_off = switch_on()
     wait_until(lambda: source.read(0.05) and source.state == "streaming")
-    again = next_frame(source)
-    assert number(again) > number(frame)
+    again = read_next_frame(source)
+    assert read_number(again) > read_number(frame)
     assert again.t_mono_s > frame.t_mono_s
     switch_off()
 
@@ -196,7 +196,7 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
     source = live(Camera(make_shot(each, 1000.0) for each in range(5)), clock=clock)
     wait_until(lambda: source.dropped == 4)
     clock.now_s += 1.5
-    frame = next_frame(source)
+    frame = read_next_frame(source)
     assert (frame.image == make_shot(4).convert()).all()
     assert (frame.name, frame.t_mono_s) == ("frame 000004 t=0.000 s", 1000.0)
     assert source.read(0) is None
@@ -219,7 +219,7 @@ def test_source_without_new_images_is_reported_and_reopened(given, condition, te
     assert source.state.startswith(text)
     assert not first.is_released.is_set() or condition is Condition.LOST
     wait_until(lambda: first.is_released.is_set() and source.condition is Condition.RUNNING)
-    assert next_frame(source)
+    assert read_next_frame(source)
     assert source.state == "streaming"
 
 
@@ -234,7 +234,7 @@ def test_image_cached_by_the_server_is_not_new_after_a_loss(live):
 
 def test_image_older_than_the_previous_one_is_refused(live):
     source = live(Camera([make_shot(1, 998.1), make_shot(2, 998.0)]), clock=FakeClock())
-    assert next_frame(source).t_mono_s == 998.1
+    assert read_next_frame(source).t_mono_s == 998.1
     wait_until(lambda: source.refused["late"] == 1)
     assert source.latency_s == pytest.approx(1.9)
 
@@ -277,7 +277,7 @@ def test_driver_error_counts_as_a_loss_with_its_message():
 
 def test_image_that_cannot_be_converted_is_skipped(live):
     broken = replace(make_shot(1), convert=lambda: 1 / 0)
-    assert next_frame(live(Camera(yield_paced([broken, *map(make_shot, range(2, 20))], 20))))
+    assert read_next_frame(live(Camera(yield_paced([broken, *map(make_shot, range(2, 20))], 20))))
 
 
 def test_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch, live):

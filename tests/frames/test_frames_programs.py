@@ -36,7 +36,7 @@ def rpicam(tmp_path, monkeypatch, open_live_source):
     return lambda: open_live_source("rpicam")
 
 
-def running(program="fake_rpicam.py"):
+def list_processes(program="fake_rpicam.py"):
     """The process ids of the programs that stand for rpicam-vid, or of another one."""
     found = subprocess.run(["pgrep", "-f", program], capture_output=True, text=True).stdout.split()
     return set(map(int, found))
@@ -50,12 +50,12 @@ def check_three_frames(source, shape):
 
 
 def test_ribbon_camera_gives_complete_images_and_its_program_ends_with_the_source(rpicam):
-    before = running()
+    before = list_processes()
     source = rpicam()
     check_three_frames(source, (960, 1280, 3))
-    assert running() - before
+    assert list_processes() - before
     source.close()
-    wait_until(lambda: not running() - before)
+    wait_until(lambda: not list_processes() - before)
 
 
 def test_ribbon_camera_is_restarted_if_it_hangs(rpicam, monkeypatch):
@@ -69,11 +69,11 @@ def test_ribbon_camera_is_restarted_if_it_hangs(rpicam, monkeypatch):
 def test_ribbon_camera_may_start_slowly(rpicam, monkeypatch):
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.5)
     monkeypatch.setenv("FAKE_RPICAM", "slow")
-    before = running()
+    before = list_processes()
     source = rpicam()
-    (process,) = wait_until(lambda: running() - before)
+    (process,) = wait_until(lambda: list_processes() - before)
     assert wait_until(lambda: source.read(1.0))
-    assert running() - before == {process}, "it was not started anew"
+    assert list_processes() - before == {process}, "it was not started anew"
 
 
 def test_program_without_images_is_ended_after_a_timeout(rpicam, monkeypatch):
@@ -130,21 +130,21 @@ def test_open_source_refuses_an_invalid_pipeline(pipeline):
 @needs_gstreamer
 @pytest.mark.parametrize("end", ["", " ! videoconvert ! appsink drop=true"])
 def test_pipeline_gives_images_and_ends_with_the_source(open_live_source, end):
-    before = running("gst-launch-1.0 -q videotestsrc")
+    before = list_processes("gst-launch-1.0 -q videotestsrc")
     source = open_live_source(GST + end)
     check_three_frames(source, (240, 320, 3))
     wait_until(lambda: source.read(1.0) and source.latency_s < 1)
     source.close()
-    wait_until(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)
+    wait_until(lambda: not list_processes("gst-launch-1.0 -q videotestsrc") - before)
 
 
 def test_programs_end_with_a_killed_flight(rpicam):
-    before = running()
+    before = list_processes()
     reading = (
         "from edgevpr.frames.source import open_source; s = open_source('rpicam', live=True)\nwhile True: s.read(1)"
     )
     flight = subprocess.Popen([sys.executable, "-c", reading])
-    wait_until(lambda: running() - before)
+    wait_until(lambda: list_processes() - before)
     flight.kill()
     flight.wait()
-    wait_until(lambda: not running() - before)
+    wait_until(lambda: not list_processes() - before)

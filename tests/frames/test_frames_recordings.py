@@ -43,7 +43,7 @@ def video(tmp_path):
     return path
 
 
-def all_frames(source):
+def read_all_frames(source):
     return list(filter(None, read_to_end(source, pytest.fail)))
 
 
@@ -56,10 +56,10 @@ def test_folder_gives_names_in_utf_8(folder):
     path = os.path.join(os.fsencode(folder), b"caf\xe9.png")
     with open(path, "wb") as file:
         file.write(photographs.encode_image(".png", photographs.picture()))
-    (frame,) = all_frames(open_source(str(folder), live=False))
+    (frame,) = read_all_frames(open_source(str(folder), live=False))
     assert frame.name == "caf\\xe9.png"
     (folder / "positions.csv").write_text("file,lat,lon\ncaf\\xe9.png,50,8\n")
-    (frame,) = all_frames(open_source(str(folder), live=False))
+    (frame,) = read_all_frames(open_source(str(folder), live=False))
     assert frame.position == Position(50, 8)
 
 
@@ -69,7 +69,7 @@ def test_folder_gives_each_image_once_in_order(folder):
     source = open_source(str(folder), live=False, clock=lambda: 12.5)
     assert source.total == 3
     assert source.state == "reading"
-    frames = all_frames(source)
+    frames = read_all_frames(source)
     assert [frame.name for frame in frames] == ["img1.png", "img9.jpg", "img10.png"]
     assert {frame.t_mono_s for frame in frames} == {12.5}
     assert source.state == "ended"
@@ -84,7 +84,7 @@ def test_positions_come_from_the_csv_and_for_images_it_does_not_name_from_exif(f
     (folder.parent / "positions.csv").write_text(
         "file,lat,lon,yaw_deg,time,roll_deg,rel_alt\nin csv.jpg,1,2,90,7,-7,80\nwithout.jpg,,,,,,\n"
     )
-    in_csv, not_in_csv, without = all_frames(open_source(str(folder), live=False))
+    in_csv, not_in_csv, without = read_all_frames(open_source(str(folder), live=False))
     assert (in_csv.position, in_csv.heading_deg, in_csv.t_utc_s) == (Position(1.0, 2.0), 90.0, 7.0)
     assert (in_csv.roll_deg, in_csv.height_m) == (-7.0, 80.0)
     assert not_in_csv.position == Position(50.5, 14.25)
@@ -125,13 +125,13 @@ def test_positions_that_do_not_fit_the_source_are_refused(folder, video, tmp_pat
 def test_video_frames_have_the_positions_of_the_table(video, tmp_path):
     table = tmp_path / "flight.csv"
     table.write_text("time,lat,lon,yaw_deg,height_m\n0.5,47,8,350,50\n1.5,47.001,8,10,60\n")
-    frames = all_frames(open_source(str(video), positions=table, live=False))
+    frames = read_all_frames(open_source(str(video), positions=table, live=False))
     assert len(frames) == len(SHADES)
     placed = [frame for frame in frames if frame.position]
     assert [placed[0].name, placed[-1].name] == ["frame 000005 t=0.500 s", "frame 000015 t=1.500 s"]
     assert placed[5].position.lat_deg == pytest.approx(47.0005)
     assert (placed[5].heading_deg, placed[5].height_m, placed[5].t_utc_s) == (0.0, 55.0, None)
-    step = all_frames(open_source(str(video), step_s=0.5, positions=table, live=False))
+    step = read_all_frames(open_source(str(video), step_s=0.5, positions=table, live=False))
     assert [frame.position for frame in step if frame.position] == [placed[at].position for at in (0, 5, 10)]
 
 
@@ -146,7 +146,7 @@ def test_positions_of_another_time_than_the_video_are_refused(video, tmp_path, t
 def test_video_gives_every_frame_to_its_end(video):
     source = open_source(str(video), live=False, clock=lambda: 12.5)
     assert source.total == len(SHADES)
-    frames = all_frames(source)
+    frames = read_all_frames(source)
     assert find_shades(frames) == list(range(len(SHADES)))
     assert [frame.name for frame in frames[1:3]] == ["frame 000001 t=0.100 s", "frame 000002 t=0.200 s"]
     assert frames[0].t_mono_s == 12.5
@@ -156,7 +156,7 @@ def test_video_gives_every_frame_to_its_end(video):
 @pytest.mark.parametrize(("step_s", "stride"), [(0.1, 1), (0.3, 3), (0.25, 3), (1.0, 10), (60.0, 25)])
 def test_frames_of_a_video_are_at_least_a_step_apart(step_s, stride, video):
     source = open_source(str(video), step_s=step_s, live=False)
-    frames = all_frames(source)
+    frames = read_all_frames(source)
     assert find_shades(frames) == list(range(len(SHADES)))[::stride]
     assert abs(source.total - len(frames)) <= 1
 
@@ -167,10 +167,10 @@ def test_open_source_reads_only_the_requested_frames(folder, video):
     (folder / "d.png").write_bytes(b"no picture, and not asked for")
     source = open_source(str(folder), live=False, only=["c.png", "a.png", "absent.png"])
     assert source.total == 2
-    assert [frame.name for frame in all_frames(source)] == ["a.png", "c.png"]
+    assert [frame.name for frame in read_all_frames(source)] == ["a.png", "c.png"]
     named = ["frame 000003 t=0.300 s", "frame 000007 t=0.700 s"]
-    assert [frame.name for frame in all_frames(open_source(str(video), live=False, only=named))] == named
-    assert all_frames(open_source(str(folder), live=False, only=[])) == []
+    assert [frame.name for frame in read_all_frames(open_source(str(video), live=False, only=named))] == named
+    assert read_all_frames(open_source(str(folder), live=False, only=[])) == []
 
 
 def film(path, codec, options, **container):

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from distorted_cameras import SIZE_PX, DistortedCamera, fisheye, wide
+from distorted_cameras import SIZE_PX, DistortedCamera, make_fisheye_camera, make_wide_camera
 
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.types import Frame
@@ -45,7 +45,7 @@ def write_lens(path, text, **given):
 
 
 @pytest.mark.parametrize("name", ["lens.yaml", "lens.xml", "lens.json"])
-@pytest.mark.parametrize("camera", [wide(), fisheye()])
+@pytest.mark.parametrize("camera", [make_wide_camera(), make_fisheye_camera()])
 def test_read_lens_of_opencv_in_all_its_forms(tmp_path, name, camera):
     path = camera.write(tmp_path / name)
     path.write_text(path.read_text().replace("%YAML 1.2", "%YAML:1.0"))  # as OpenCV 4 writes it
@@ -69,7 +69,7 @@ def photograph_board(camera, rng):
 
 @pytest.mark.slow
 def test_calibration_script_of_the_docs_recovers_a_known_lens(tmp_path, monkeypatch):
-    camera, page = wide(), (Path(__file__).parents[2] / "docs/how-to/cameras.md").read_text("utf-8")
+    camera, page = make_wide_camera(), (Path(__file__).parents[2] / "docs/how-to/cameras.md").read_text("utf-8")
     (tmp_path / "board").mkdir()
     rng = np.random.default_rng(0)
     for number in range(40):
@@ -156,7 +156,7 @@ def difference(one, other):
     return np.abs(one.astype(float) - other).mean()
 
 
-CAMERAS = pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "fisheye"])
+CAMERAS = pytest.mark.parametrize("camera", [make_wide_camera(), make_fisheye_camera()], ids=["wide", "fisheye"])
 
 
 @CAMERAS
@@ -203,7 +203,7 @@ def test_level_image_levels_and_undistorts_in_one_warp(camera, ground, pose):
 
 
 def test_undistort_frame_moves_the_mask_with_its_image(ground):
-    camera = wide()
+    camera = make_wide_camera()
     overlay = np.ones(SIZE_PX[::-1], bool)
     overlay[:, :160] = False
     grey = np.where(overlay, 255, 0).astype(np.uint8)
@@ -230,7 +230,7 @@ def test_level_image_masks_what_is_outside_the_lens(ground):
 
 
 def test_frames_of_another_size_are_scaled_and_of_another_shape_refused(ground):
-    camera = wide()
+    camera = make_wide_camera()
     lens, frame = make_lens(camera), photograph(camera, ground)
     small = cv2.resize(frame.image, (320, 240), interpolation=cv2.INTER_AREA)
     half = undistort_frame(small, None, UNKNOWN_VIEW, lens).image

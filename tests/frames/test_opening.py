@@ -143,7 +143,7 @@ def test_open_device_names_the_cause(path, cause):
     assert str(refusal.value) == cause
 
 
-def first_frame(source):
+def read_first_frame(source):
     frame = wait_until(lambda: source.read(0.05))
     assert frame.image.shape == (HEIGHT, WIDTH, 3)
     assert frame.image.std() > 5
@@ -154,7 +154,7 @@ def first_frame(source):
 @pytest.mark.parametrize("over_tcp", ["461", "offer"])
 def test_rtsp_falls_back_to_udp(over_tcp, open_live_source, serve):
     source = open_live_source(f"rtsp://{serve(rtsp(refuses='', over_tcp=over_tcp))}/stream")
-    first_frame(source)
+    read_first_frame(source)
     assert (source.facts.codec, source.facts.bits, source.facts.pixel_aspect) == ("h264", 8, 1.0)
 
 
@@ -170,7 +170,7 @@ def test_rtsp_falls_back_to_udp(over_tcp, open_live_source, serve):
 )
 def test_rtp_at_a_udp_port_is_read_without_a_description(scheme, send, codec, open_live_source, start_sending):
     source = open_live_source(f"{scheme}://127.0.0.1:{start_sending(send)}")
-    first_frame(source)
+    read_first_frame(source)
     assert source.facts.codec == codec
 
 
@@ -202,7 +202,7 @@ def test_rtp_of_an_unknown_codec_asks_for_a_description(start_sending):
 @pytest.mark.parametrize(("kind", "extension"), [("image/jpg", ".jpg"), ("image/png", ".png")])
 def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, open_live_source, serve):
     source = open_live_source(f"http://{serve(multipart(kind, extension, has_length))}/video")
-    numbers = [int(first_frame(source).name.split()[1]) for _ in range(3)]
+    numbers = [int(read_first_frame(source).name.split()[1]) for _ in range(3)]
     assert numbers == sorted(set(numbers))
 
 
@@ -212,7 +212,7 @@ def test_multipart_stream_without_lengths_does_not_wait_for_the_next_part(open_l
     source = open_live_source(f"http://{serve(multipart(has_length=False, connections=connections))}/video")
     late_s = []
     for _ in range(12):
-        frame = first_frame(source)
+        frame = read_first_frame(source)
         sent_s = connections[-1]  # the first was FFmpeg's
         (number,) = (at for at in range(len(sent_s)) if abs(frame.image.astype(int) - picture(at)).mean() < 4)
         late_s.append(frame.t_mono_s - sent_s[number])
@@ -238,12 +238,12 @@ def test_connection_of_a_multipart_stream_is_closed_with_the_capture(serve):
 def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
     asked_s: list[float] = []
 
-    def taken(number):
+    def take_snapshot(number):
         asked_s.append(time.monotonic())
         time.sleep(0.05)
         return encode_image(number)
 
-    address = serve(http("200 OK", "image/jpeg", taken))
+    address = serve(http("200 OK", "image/jpeg", take_snapshot))
     capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     first, second = capture.read(), capture.read()
     assert not (first.convert() == second.convert()).all()

@@ -19,13 +19,13 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 RATE_HZ = 20
 
 
-def transport_stream(connection, codec="mpeg2video", **options):
+def open_encoder(connection, codec="mpeg2video", **options):
     """An encoder of MPEG-TS for a viewer."""
     return Encoder(connection.sendall, "mpegts", codec, RATE_HZ, (WIDTH, HEIGHT), {"g": "5", **options})
 
 
-def send_then_sound(connection):
-    encoder = transport_stream(connection)
+def send_late_audio(connection):
+    encoder = open_encoder(connection)
     sound = encoder.box.add_stream("mp2", rate=16000)
     sound.layout = "mono"
     for number in range(10**6):
@@ -37,23 +37,23 @@ def send_then_sound(connection):
         time.sleep(1 / RATE_HZ)
 
 
-def one_codec(connection):
-    encoder = transport_stream(connection, "libx264", tune="zerolatency")
+def send_one_codec(connection):
+    encoder = open_encoder(connection, "libx264", tune="zerolatency")
     for number in range(10**6):
         encoder.write(number, picture(number))
         time.sleep(1 / RATE_HZ)
 
 
-def two_codecs(connection):
+def send_two_codecs(connection):
     """The codec changes: from then on no packet is of the stream that the viewer has opened."""
-    encoder = transport_stream(connection)
+    encoder = open_encoder(connection)
     for number in range(60):
         encoder.write(number, picture(number))
         time.sleep(1 / RATE_HZ)
-    one_codec(connection)
+    send_one_codec(connection)
 
 
-@pytest.mark.parametrize(("first", "later"), [(send_then_sound, send_then_sound), (two_codecs, one_codec)])
+@pytest.mark.parametrize(("first", "later"), [(send_late_audio, send_late_audio), (send_two_codecs, send_one_codec)])
 def test_stream_without_further_images_is_lost_and_reopened(first, later):
     viewers = []
 

@@ -14,7 +14,7 @@ NAMESPACES = (
 )
 
 
-def packet(attributes="", elements=""):
+def make_packet(attributes="", elements=""):
     return (
         '<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
         '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -26,20 +26,22 @@ def packet(attributes="", elements=""):
 def read(tmp_path):
     """Read a packet from the place where cameras put it, in a segment before the picture."""
 
-    def of(content):
+    def read_packet(content):
         jpeg = photographs.encode_image(".jpg", photographs.picture())
         path = tmp_path / "photo.jpg"
-        path.write_bytes(photographs.with_app1(jpeg, content, b"http://ns.adobe.com/xap/1.0/\x00"))
+        path.write_bytes(photographs.insert_app1(jpeg, content, b"http://ns.adobe.com/xap/1.0/\x00"))
         return read_xmp(path)
 
-    return of
+    return read_packet
 
 
 def gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
     return f'{maker}YawDegree="{yaw}" {maker}PitchDegree="{pitch}" {maker}RollDegree="{roll}"'
 
 
-DJI = packet('drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + gimbal("-30.0", "-80.0", 0))
+DJI = make_packet(
+    'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + gimbal("-30.0", "-80.0", 0)
+)
 SKYDIO_ATTRIBUTES = (
     '<drone-skydio:CameraOrientationNED drone-skydio:Pitch="-90" drone-skydio:Roll="0" drone-skydio:Yaw="75"/>'
 )
@@ -62,17 +64,17 @@ NOSE = 'drone-dji:RelativeAltitude="+39.80" drone-dji:FlightYawDegree="-60.5" dr
     ("content", "heading_deg", "roll_deg", "pitch_deg", "height_m"),
     [
         (DJI, 330, 0, 10, 40.1),
-        (packet('drone:RelativeAltitude="51.2" ' + gimbal(75, -90, 0, "drone:Gimbal")), 75, 0, 0, 51.2),  # Autel
-        (packet('drone:FlightYawDegree="-60"'), 300, None, None, None),
-        (packet(SKYDIO_HEIGHT, SKYDIO_BODY + SKYDIO_ATTRIBUTES + SKYDIO_BODY), 75, 0, 0, 42.5),
-        (packet(SKYDIO_HEIGHT, SKYDIO_BODY + SKYDIO_ELEMENTS + SKYDIO_BODY), 75, 0, 0, 42.5),
-        (packet(elements=PARROT), 176.3, 0, 11.6, None),
-        (packet('Camera:Yaw="-10" Camera:Pitch="4.5" Camera:Roll="-3"'), 350, -3, 4.5, None),  # Pix4D: 0 is down
-        (packet('Camera:Yaw="0" Camera:Pitch="0" Camera:Roll="0"'), None, None, None, None),  # no IMU
-        (packet(NOSE + gimbal("+0.00", "+0.00", "+0.00")), 299.5, None, None, 39.8),
-        (packet(gimbal(-60, -90, 180)), 120, 0, 0, None),  # half a turn of the roll is half a turn of the picture
-        (packet(gimbal(100, -90, 20)), 120, 0, 0, None),
-        (packet(gimbal(30, -0.5, 0)), 30, 0, 89.5, None),  # it looks ahead
+        (make_packet('drone:RelativeAltitude="51.2" ' + gimbal(75, -90, 0, "drone:Gimbal")), 75, 0, 0, 51.2),  # Autel
+        (make_packet('drone:FlightYawDegree="-60"'), 300, None, None, None),
+        (make_packet(SKYDIO_HEIGHT, SKYDIO_BODY + SKYDIO_ATTRIBUTES + SKYDIO_BODY), 75, 0, 0, 42.5),
+        (make_packet(SKYDIO_HEIGHT, SKYDIO_BODY + SKYDIO_ELEMENTS + SKYDIO_BODY), 75, 0, 0, 42.5),
+        (make_packet(elements=PARROT), 176.3, 0, 11.6, None),
+        (make_packet('Camera:Yaw="-10" Camera:Pitch="4.5" Camera:Roll="-3"'), 350, -3, 4.5, None),  # Pix4D: 0 is down
+        (make_packet('Camera:Yaw="0" Camera:Pitch="0" Camera:Roll="0"'), None, None, None, None),  # no IMU
+        (make_packet(NOSE + gimbal("+0.00", "+0.00", "+0.00")), 299.5, None, None, 39.8),
+        (make_packet(gimbal(-60, -90, 180)), 120, 0, 0, None),  # half a turn of the roll is half a turn of the picture
+        (make_packet(gimbal(100, -90, 20)), 120, 0, 0, None),
+        (make_packet(gimbal(30, -0.5, 0)), 30, 0, 89.5, None),  # it looks ahead
     ],
 )
 def test_read_xmp_of_each_maker(read, content, heading_deg, roll_deg, pitch_deg, height_m, tmp_path):
@@ -88,20 +90,20 @@ def test_read_xmp_of_each_maker(read, content, heading_deg, roll_deg, pitch_deg,
 def test_read_xmp_of_a_gimbal_tilted_to_its_side(read):
     """It looks east and 20 degrees up from straight down, and a roll by -90 turns the top of its picture to north: that
     is a camera that leans to the left."""
-    found = read(packet(gimbal(90, -70, -90)))
+    found = read(make_packet(gimbal(90, -70, -90)))
     assert (found.roll_deg, found.pitch_deg) == pytest.approx((-20, 0), abs=1e-6)
     assert math.remainder(found.heading_deg, 360) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("value", ["nan", "-1e9", "361", "", "0/100", "north", "+-"])
 def test_read_xmp_treats_an_implausible_value_as_unknown(read, value):
-    assert read(packet(gimbal(10, value, 0))) == GeoTag()
-    assert read(packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
+    assert read(make_packet(gimbal(10, value, 0))) == GeoTag()
+    assert read(make_packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
 
 
 def test_read_xmp_reads_only_numbers_of_the_first_packet_near_the_beginning(read, tmp_path):
-    first = packet('drone-dji:RelativeAltitude="40"')
-    assert read(first + packet('drone-dji:RelativeAltitude="50"')).height_m == 40.0
+    first = make_packet('drone-dji:RelativeAltitude="40"')
+    assert read(first + make_packet('drone-dji:RelativeAltitude="50"')).height_m == 40.0
     assert read(b'<!DOCTYPE x [<!ENTITY j "40">]>' + first.replace(b"40", b"&j;")) == GeoTag()
     path = tmp_path / "p.jpg"
     path.write_bytes(bytes(400_000) + first)

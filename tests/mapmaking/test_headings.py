@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pictures import rough_ground
+from pictures import draw_rough_ground
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
@@ -20,7 +20,7 @@ LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 @pytest.fixture(scope="module")
 def frames():
     """Frames of a camera that looks 45 degrees ahead and turns as it goes aside, with their true headings."""
-    ground = np.repeat(rough_ground(1200)[..., None], 3, axis=2)
+    ground = np.repeat(draw_rough_ground(1200)[..., None], 3, axis=2)
     made, rng = [], np.random.default_rng(1)
     for number in range(5):
         heading_deg, east_m, north_m = 20.0 + 6 * number, 130.0 + 4 * number, 60.0 + 6 * number

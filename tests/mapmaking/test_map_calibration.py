@@ -5,7 +5,7 @@ from collections import Counter
 import cv2
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map, query_meter
 
 from edgevpr.core.config import load_config
@@ -35,7 +35,7 @@ AHEAD = create("cohog", {"w1": 208})
 
 def frame(number, **more):
     position = Position(50 + 0.002 * number, 8.0)
-    return Frame(image=textured(number, 240, 320), name=f"{number}.png", t_mono_s=0.0, position=position, **more)
+    return Frame(image=draw_texture(number, 240, 320), name=f"{number}.png", t_mono_s=0.0, position=position, **more)
 
 
 def make_picture_source(*frames):
@@ -62,7 +62,7 @@ def place_map(tmp_path):
         yield place_map
 
 
-def calibrate_with(place_map, pictures, technique=AHEAD, **more):
+def calibrate_map(place_map, pictures, technique=AHEAD, **more):
     encoder = FrameEncoder(technique=technique, **more)
     return calibrate(encoder, place_map, CONFIG, query_meter(), pictures, iterate_silently)
 
@@ -82,7 +82,7 @@ def test_query_map_queries_each_image_in_three_ways(place_map):
 
 def test_calibration_is_stored_in_the_map(place_map):
     pictures, asked = make_picture_source(*map(frame, range(PLACES)))
-    found = calibrate_with(place_map, pictures)
+    found = calibrate_map(place_map, pictures)
     assert read_calibration(place_map.calibration) == found
     assert sorted(asked) == sorted(3 * [f"{number}.png" for number in range(PLACES)]), "once for its look-alikes"
     assert sorted(found.look_alikes.places) == list(range(1, PLACES + 1))
@@ -96,7 +96,7 @@ def test_calibration_skips_an_unreadable_place(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")
     build_map([frame(20)], FrameEncoder(technique=AHEAD), place_map)
-    found = calibrate_with(place_map, make_picture_source(*map(frame, (*range(PLACES), 20)))[0])
+    found = calibrate_map(place_map, make_picture_source(*map(frame, (*range(PLACES), 20)))[0])
     assert sorted(found.recognisable) == [1, 2, 4, 5, 6, 7, 8, 9]
 
 
@@ -105,14 +105,14 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
     down = create("cohog", {"camera": "nadir", "w1": 208})
     tilted = [frame(number, roll_deg=8.0, pitch_deg=-6.0, heading_deg=40.0, height_m=90.0) for number in range(PLACES)]
 
-    def levelling():
+    def make_levelling():
         return Levelling(Lens(60.0), below=True, is_live=False)
 
-    path = make_map(tmp_path / "m.gpkg", down, tilted, levelling=levelling())
+    path = make_map(tmp_path / "m.gpkg", down, tilted, levelling=make_levelling())
     with PlaceMap.open_for_writing(path) as place_map:
         with pytest.raises(UsageError, match=" 0 places"):
-            calibrate_with(place_map, make_picture_source(tilted[0])[0], down)
-        found = calibrate_with(place_map, make_picture_source(*tilted)[0], down, levelling=levelling())
+            calibrate_map(place_map, make_picture_source(tilted[0])[0], down)
+        found = calibrate_map(place_map, make_picture_source(*tilted)[0], down, levelling=make_levelling())
     assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
 
 
@@ -141,7 +141,7 @@ def test_calibration_reports_a_map_that_looks_alike_everywhere(tmp_path):
         return Frame(image=image, name=f"{number}.png", t_mono_s=0.0, position=Position(50 + 0.002 * number, 8.0))
 
     with PlaceMap.open_for_writing(make_map(tmp_path / "m.gpkg", AHEAD, map(water, range(PLACES)))) as place_map:
-        found = calibrate_with(place_map, make_picture_source(*map(water, range(PLACES)))[0])
+        found = calibrate_map(place_map, make_picture_source(*map(water, range(PLACES)))[0])
     assert found.looks_alike
     assert found.accepted < 0.3
 
@@ -176,18 +176,18 @@ def test_fit_logistic_with_a_strong_prior_changes_only_the_bias():
 
 
 def test_change_picture_moves_the_mask_with_the_image():
-    image = textured(4)
+    image = draw_texture(4)
     shown = np.zeros(image.shape, bool)
     shown[:, 80:] = True
     image = np.where(shown, 40 + image // 4, 190 + image // 4)
 
-    def apart(picture, part):
+    def measure_contrast(picture, part):
         return abs(float(picture[part].mean()) - float(picture[~part].mean()))
 
     followed, left = [], []
     for seed in range(12):
         seen, now = change_picture(image, np.random.default_rng(seed), True, shown)
         assert (now.shape, now.dtype) == (image.shape, bool)
-        followed.append(apart(seen, now))
-        left.append(apart(seen, shown))
+        followed.append(measure_contrast(seen, now))
+        left.append(measure_contrast(seen, shown))
     assert np.mean(followed) > 1.5 * np.mean(left)

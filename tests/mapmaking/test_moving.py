@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from commands import refused, run_json
+from commands import expect_refusal, run_json
 
 from edgevpr.cli.main import main
 from edgevpr.core.contract import Descriptor
@@ -90,7 +90,7 @@ def test_move_map_applies_a_log_only_once(path):
 @pytest.mark.parametrize("lines", [(), (SURVEY | RESULT | {"off_m": None, "off_sd": None},), (RESULT, SURVEY)])
 def test_move_map_moves_nothing_without_a_survey(path, lines, capsys):
     log, before = write_flight_log(path, *lines), read_places(path)
-    assert "map offset" in refused(capsys, "map", "move", path, "--by", log)
+    assert "map offset" in expect_refusal(capsys, "map", "move", path, "--by", log)
     assert read_places(path) == before
 
 

@@ -7,7 +7,7 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 
 import rasterio
 from rasterio.warp import transform
-from rasters import HOME, MARKS_M, draw_marks, grid, marked_raster, write_raster
+from rasters import HOME, MARKS_M, draw_marks, grid, write_marked_raster, write_raster
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -51,7 +51,7 @@ def require_marks(picture: np.ndarray, footprint_m: float = FOOTPRINT_M, within_
     ],
 )
 def test_cut_places_marks_correctly_with_true_north_up(tmp_path, crs, rotation_deg):
-    picture, valid = cut(marked_raster(tmp_path / "o.tif", crs, rotation_deg=rotation_deg, side_px=720))
+    picture, valid = cut(write_marked_raster(tmp_path / "o.tif", crs, rotation_deg=rotation_deg, side_px=720))
     assert picture.shape == (SIDE_PX, SIDE_PX, 3)
     assert picture.dtype == np.uint8
     assert valid.all()
@@ -78,14 +78,14 @@ def test_orthophoto_reads_a_file_across_the_antimeridian(tmp_path, crs, west):
 
 @pytest.mark.parametrize("pixel_m", [0.07, 0.45])
 def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place(tmp_path, pixel_m):
-    path = marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))
+    path = write_marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))
     picture, valid = cut(path)
     assert valid.all()
     require_marks(picture, within_px=0.2)
 
 
 def test_cut_masks_ground_beyond_the_edge(tmp_path):
-    path = marked_raster(tmp_path / "o.tif")  # 160 m wide
+    path = write_marked_raster(tmp_path / "o.tif")  # 160 m wide
     orthophoto = Orthophoto(path)
     _, valid = orthophoto.cut(HOME, 320.0, SIDE_PX)
     assert valid.mean() == pytest.approx(0.25, abs=0.01)
@@ -130,7 +130,7 @@ def test_orthophoto_reads_each_file_format(tmp_path, kind):
         require_marks(picture)
 
 
-def refused(path) -> str:
+def read_refusal(path) -> str:
     with pytest.raises(SourceError) as caught:
         Orthophoto(path)
     assert str(caught.value).endswith(".")
@@ -141,29 +141,29 @@ def test_orthophoto_refuses_other_files_in_one_sentence(tmp_path):
     to_crs, east_m, north_m = grid("EPSG:32632", 1.0, 64)
     bright = draw_marks(east_m, north_m)
     byte = bright.astype(np.uint8)[None]
-    assert "missing.tif" in refused(tmp_path / "missing.tif")
-    assert "is a folder" in refused(tmp_path)
+    assert "missing.tif" in read_refusal(tmp_path / "missing.tif")
+    assert "is a folder" in read_refusal(tmp_path)
     (tmp_path / "notes.tif").write_text("not a raster")
-    assert "opened" in refused(tmp_path / "notes.tif")
+    assert "opened" in read_refusal(tmp_path / "notes.tif")
     no_crs = write_raster(tmp_path / "a.tif", byte, None, to_crs)
-    assert "georeference" in refused(no_crs)
+    assert "georeference" in read_refusal(no_crs)
     no_place = write_raster(tmp_path / "b.tif", byte, "EPSG:32632", rasterio.Affine.identity())
-    assert "georeference" in refused(no_place)
+    assert "georeference" in read_refusal(no_place)
     heights = write_raster(tmp_path / "c.tif", bright[None].astype(np.float32), "EPSG:32632", to_crs)
-    assert "float32" in refused(heights)
-    assert "8-bit" in refused(heights)
+    assert "float32" in read_refusal(heights)
+    assert "8-bit" in read_refusal(heights)
     deep = write_raster(tmp_path / "f.tif", bright[None].astype(np.uint16), "EPSG:32632", to_crs)
-    assert "gdal_translate -ot Byte" in refused(deep)
+    assert "gdal_translate -ot Byte" in read_refusal(deep)
     local = write_raster(tmp_path / "d.tif", byte, 'LOCAL_CS["site",UNIT["metre",1]]', to_crs)
-    assert "latitude" in refused(local)
+    assert "latitude" in read_refusal(local)
     palette = write_raster(tmp_path / "e.tif", byte, "EPSG:32632", to_crs, photometric="palette")
     with rasterio.open(palette, "r+") as data:
         data.write_colormap(1, {number: (number, 0, 0, 255) for number in range(256)})
-    assert "palette" in refused(palette)
+    assert "palette" in read_refusal(palette)
 
 
 def test_cut_refuses_a_truncated_file(tmp_path):
-    path = marked_raster(tmp_path / "o.tif")
+    path = write_marked_raster(tmp_path / "o.tif")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(ImageError, match="copy"):

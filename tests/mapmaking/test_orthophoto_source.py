@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
 import rasterio
-from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_raster
+from rasters import HOME, grid, ground_m, write_marked_raster, write_raster, write_textured_raster
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_position
@@ -44,7 +44,7 @@ def waypoint(east_m: float, north_m: float) -> Waypoint:
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])
 def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
-    path = marked_raster(tmp_path / "o.tif", crs, pixel_m=0.5, side_px=400)
+    path = write_marked_raster(tmp_path / "o.tif", crs, pixel_m=0.5, side_px=400)
     lattice = make_lattice(Orthophoto(path), 80.0, 20.0)
     points_m = compute_offsets_m(lattice).reshape(*lattice.shape, 2)
     assert min(lattice.shape) >= 3
@@ -55,7 +55,7 @@ def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
 
 
 def test_frames_have_position_and_footprint(tmp_path):
-    source = open_grid(marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400), 80.0, 60.0)
+    source = open_grid(write_marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400), 80.0, 60.0)
     frames = read_all_frames(source)
     assert source.total == 9 == len(frames)
     assert (source.is_live, source.dropped, source.state, source.read(0)) == (False, None, "ended", None)
@@ -80,12 +80,12 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
     assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
 
-    turned = open_grid(marked_raster(tmp_path / "turned.tif", rotation_deg=45), 40.0, 40.0)
+    turned = open_grid(write_marked_raster(tmp_path / "turned.tif", rotation_deg=45), 40.0, 40.0)
     assert 0.3 < len(read_all_frames(turned)) / turned.total < 0.7
 
 
 def test_make_lattice_keeps_places_near_the_path_of_the_area(tmp_path):
-    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
+    path = write_marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
     way = Area(path=(waypoint(-100, -50), waypoint(50, 100), waypoint(50, 150)))
     points_m = compute_offsets_m(make_lattice(Orthophoto(path), 25.0, 5.0, way))
     ends_m = np.array([(-100, -50), (50, 100), (50, 150)], float)
@@ -111,13 +111,13 @@ def test_make_lattice_keeps_places_near_the_path_of_the_area(tmp_path):
     ],
 )
 def test_make_lattice_refuses_an_invalid_grid(tmp_path, footprint_m, spacing_m, said):
-    orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
+    orthophoto = Orthophoto(write_marked_raster(tmp_path / "o.tif"))
     with pytest.raises(UsageError, match=said):
         make_lattice(orthophoto, footprint_m, spacing_m)
 
 
 def test_make_lattice_refuses_an_area_elsewhere_with_both_extents(tmp_path):
-    orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
+    orthophoto = Orthophoto(write_marked_raster(tmp_path / "o.tif"))
     for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
         with pytest.raises(UsageError, match=r"\d north, .*\d east, .* 49\.99.* east\.$"):
             make_lattice(orthophoto, 40.0, 10.0, Area(path=(way,)))
@@ -127,7 +127,7 @@ def test_make_lattice_refuses_an_area_elsewhere_with_both_extents(tmp_path):
 
 
 def test_make_lattice_keeps_grid_and_names_within_an_area(tmp_path):
-    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
+    path = write_marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
     every = {frame.name: frame.position for frame in read_all_frames(open_grid(path, 80.0, 30.0))}
     some = read_all_frames(open_grid(path, 80.0, 30.0, Area(path=(waypoint(60, 60),))))
     assert 2 <= len(some) < len(every)
@@ -139,7 +139,7 @@ def test_make_lattice_keeps_grid_and_names_within_an_area(tmp_path):
 
 
 def test_places_under_cloud_are_counted(tmp_path):
-    path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
+    path = write_textured_raster(tmp_path / "o.tif", pixel_m=0.5)
     with rasterio.open(path, "r+") as raster:
         raster.write(np.full((1, 200, 200), 240, np.uint8), window=rasterio.windows.Window(220, 220, 200, 200))
     source = open_grid(path, 100.0, 60.0)
@@ -148,7 +148,7 @@ def test_places_under_cloud_are_counted(tmp_path):
 
 
 def test_orthophoto_source_cuts_each_place_at_several_footprints(tmp_path):
-    path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
+    path = write_textured_raster(tmp_path / "o.tif", pixel_m=0.5)
     source = OrthophotoGrid(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()
     frames = read_all_frames(source)
     assert len({frame.name for frame in frames}) == len(frames) == source.total

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from commands import refused, run_json
+from commands import expect_refusal, run_json
 from map_writer import write_sql
 
 from edgevpr.cli.main import main
@@ -217,7 +217,7 @@ def test_map_refine_explains_why_a_map_cannot_be_refined(tmp_path, flown_dir, ma
     path = tmp_path / "hog.gpkg"
     assert main(["map", "build", str(path), "--images", str(flown_dir[0] / "images"), "--technique", "hog"]) == 0
     assert "refined:" not in capsys.readouterr().out, "a map of another kind is built as it was"
-    assert "--camera nadir" in refused(capsys, "map", "refine", path)
+    assert "--camera nadir" in expect_refusal(capsys, "map", "refine", path)
 
 
 def test_refine_skips_an_unreadable_place(map_path):

@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map
 
 from edgevpr.cli.main import main
@@ -28,7 +28,7 @@ def to_lat_lon(east_m, north_m):
 
 def frame(column, row):
     position = Position(*to_lat_lon(column * STEP_M, row * STEP_M))
-    return Frame(image=textured(10 * column + row, 96, 96), name=f"{column}{row}", t_mono_s=0.0, position=position)
+    return Frame(image=draw_texture(10 * column + row, 96, 96), name=f"{column}{row}", t_mono_s=0.0, position=position)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import pytest
 from conversing import Autopilot
 from fakes import FakeClock
-from mavlink_peers import Peer, UdpPort, link_to
+from mavlink_peers import Peer, UdpPort, make_link
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def port():
 
 @pytest.fixture
 def link(port, clock):
-    with link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
+    with make_link(f"udpout:127.0.0.1:{port.number}", clock=clock) as link:
         yield link
 
 

@@ -46,12 +46,12 @@ class Station:
     def wait_for(self, *words: str) -> str:
         """Wait for a line with all these words, and return it."""
 
-        def found():
+        def find_line():
             assert self._process.poll() is None, f"it has ended:\n{''.join(self.said)}"
             return next((line for line in self.said if all(word in line for word in words)), None)
 
         try:
-            return wait_until(found, " ".join(words), every_s=0.2)
+            return wait_until(find_line, " ".join(words), every_s=0.2)
         except AssertionError as error:
             raise AssertionError(f"{error}; it said:\n{''.join(self.said)}") from None
 
@@ -60,19 +60,19 @@ class Station:
         return self._process.wait(PATIENCE_S)
 
 
-def mavsdk_example(port: int, folder: Path) -> Station:
+def start_mavsdk_example(port: int, folder: Path) -> Station:
     """Start the example of MAVSDK beside edgevpr."""
-    _need("mavsdk")
+    _require("mavsdk")
     return Station([str(Path(__file__).parents[2] / "examples" / "mavsdk_beside.py"), str(port)], folder)
 
 
-def mavproxy_with(folder: Path, *flags: str) -> Station:
+def start_mavproxy(folder: Path, *flags: str) -> Station:
     """Start MAVProxy with these flags, without windows."""
-    _need("MAVProxy")
+    _require("MAVProxy")
     quiet = ["--default-modules=link", f"--logfile={folder / 'mavproxy.tlog'}"]
     return Station([str(CLIENTS / "bin" / "mavproxy.py"), *flags, *quiet], folder)
 
 
-def _need(package: str) -> None:
+def _require(package: str) -> None:
     if not (CLIENTS / package).is_dir():
         pytest.skip(f"{package} is not in {CLIENTS}: `make test` puts it there, where it can be had")

@@ -19,7 +19,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
 
-def link_to(url: str, **settings) -> Link:
+def make_link(url: str, **settings) -> Link:
     """Make a link by its address as a user writes it, and its settings."""
     return Link(parse_link(url), LinkSettings(**settings))
 

@@ -15,7 +15,7 @@ PX4 = mavlink.MAV_AUTOPILOT_PX4
 WRAP_MS = 2**32
 
 
-def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
+def make_autopilot(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
     """An autopilot that booted 400 s ago, when our clock stood at 600 s, and that a channel has been chosen for."""
     autopilot = Autopilot(firmware, booted_s=600.0, listener=RecordingListener())
     autopilot.conversation.autopilot.selector._decision = Decision(ChannelChoice(channel, "for a test", 1, lag_s))
@@ -23,7 +23,7 @@ def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
     return autopilot
 
 
-def next_sent(autopilot, name):
+def wait_for_message(autopilot, name):
     """The next message of this name, and when it was sent; none for a second: None."""
     for _ in range(40):
         autopilot.wait(0.025)
@@ -34,26 +34,26 @@ def next_sent(autopilot, name):
 
 
 def test_timestamps_are_in_autopilot_time_or_for_px4_in_ours():
-    autopilot = streaming(Channel.COMMAND)
+    autopilot = make_autopilot(Channel.COMMAND)
     autopilot.put_fix()
     (fix,) = [message for message in autopilot.take_sent() if message.get_type() == "COMMAND_INT"]
     assert fix.param1 == pytest.approx(autopilot.boot_s, abs=1e-3)
-    odometry, now_s = next_sent(streaming(Channel.ODOMETRY), "ODOMETRY")
+    odometry, now_s = wait_for_message(make_autopilot(Channel.ODOMETRY), "ODOMETRY")
     assert odometry.time_usec == pytest.approx((now_s - 600.0) * 1e6, abs=100)
-    odometry, now_s = next_sent(streaming(Channel.VISION, PX4), "ODOMETRY")
+    odometry, now_s = wait_for_message(make_autopilot(Channel.VISION, PX4), "ODOMETRY")
     assert odometry.time_usec == pytest.approx(now_s * 1e6, abs=100)
 
 
 def test_gps_input_has_boot_time_and_utc_without_link_jitter():
-    autopilot = streaming(Channel.GPS_INPUT, lag_s=0.2)
-    position, now_s = next_sent(autopilot, "GPS_INPUT")
+    autopilot = make_autopilot(Channel.GPS_INPUT, lag_s=0.2)
+    position, now_s = wait_for_message(autopilot, "GPS_INPUT")
     assert position.time_usec == pytest.approx((now_s - 600.2) * 1e6, abs=100)
     assert position.time_week == 0, "its UTC is not known yet"
     for late_s in (0.0, 0.3, 0.1):
         boot_ms, utc_us = autopilot.boot_ms, round((1_700_000_000 + autopilot.boot_s) * 1e6)
         autopilot.wait(late_s)
         autopilot.send(mavlink.MAVLink_system_time_message(utc_us, boot_ms))
-        position, now_s = next_sent(autopilot, "GPS_INPUT")
+        position, now_s = wait_for_message(autopilot, "GPS_INPUT")
         since_1980_s = position.time_week * 604_800 + position.time_week_ms / 1e3
         expected_s = 1_700_000_000 + (now_s - 600.2) - 315_964_800 + 18
         assert since_1980_s == pytest.approx(expected_s, abs=2.1e-3), f"{late_s} s late"
@@ -216,7 +216,7 @@ class LinkOfArduPilot:
 @pytest.mark.parametrize("foreign_s", [None, 1.7e9])
 def test_put_back_sends_ardupilot_the_position_at_its_assumed_delay(age_s, foreign_s):
     """The vehicle flies north at 20 m/s; what counts is where a fix lies beside the vehicle at the time of the fix."""
-    autopilot, link = streaming(Channel.COMMAND), LinkOfArduPilot()
+    autopilot, link = make_autopilot(Channel.COMMAND), LinkOfArduPilot()
     north_deg = 20.0 / 111_195
     for _ in range(5):
         autopilot.wait(0.5)

@@ -165,7 +165,7 @@ def test_px4_receiver_that_is_not_used_does_not_count_as_gps():
     autopilot, ear = interview(PX4)
     ear.state = None
 
-    def has_gps_after(seconds, flags):
+    def report_gps(seconds, flags):
         for _ in range(seconds * 5):
             autopilot.wait(0.2)
             autopilot.beat()
@@ -173,14 +173,14 @@ def test_px4_receiver_that_is_not_used_does_not_count_as_gps():
             autopilot.px4_filter(2.0, flags)
         return autopilot.position().has_gps
 
-    assert has_gps_after(8, GLOBAL | FUSES)
-    assert has_gps_after(1, GLOBAL), "it may just have begun"
-    assert not has_gps_after(3, GLOBAL)
-    assert has_gps_after(1, GLOBAL | FUSES), "it uses it again"
-    assert not has_gps_after(4, GLOBAL)
+    assert report_gps(8, GLOBAL | FUSES)
+    assert report_gps(1, GLOBAL), "it may just have begun"
+    assert not report_gps(3, GLOBAL)
+    assert report_gps(1, GLOBAL | FUSES), "it uses it again"
+    assert not report_gps(4, GLOBAL)
     ear.state = STATE
     collect(autopilot, "GLOBAL_POSITION_SENSOR")
-    assert not has_gps_after(3, GLOBAL | FUSES), "what it fuses is ours"
+    assert not report_gps(3, GLOBAL | FUSES), "what it fuses is ours"
 
 
 def test_conversation_sends_a_fix_between_matches_after_half_a_second():

@@ -134,7 +134,7 @@ def test_fixes_do_not_take_late_answers_for_those_to_a_new_fix(autopilot):
 
 
 def test_fixes_refused_report_the_reason_from_the_autopilot_state(autopilot):
-    def refused(result=FAILED, after_s=1.0):
+    def refuse_fix(result=FAILED, after_s=1.0):
         autopilot.wait(after_s)
         autopilot.beat(ARMED)
         autopilot.conversation.announce_changes()
@@ -144,19 +144,19 @@ def test_fixes_refused_report_the_reason_from_the_autopilot_state(autopilot):
         return sending.outcome
 
     autopilot.gps()
-    assert refused() == FixAnswer("FAILED", GPS_IN_USE, pytest.approx(0.03))
+    assert refuse_fix() == FixAnswer("FAILED", GPS_IN_USE, pytest.approx(0.03))
     autopilot.wait(2)
     autopilot.gps(fix_type=1)
-    assert refused().why.code is ReasonCode.NO_CAUSE
+    assert refuse_fix().why.code is ReasonCode.NO_CAUSE
     (request,) = autopilot.questions()
     assert (request.command, request.param1) == (512, 49), "it is asked for its origin"
-    codes = [refused(after_s=3.0).why.code] + [refused().why.code for _ in range(20)]
+    codes = [refuse_fix(after_s=3.0).why.code] + [refuse_fix().why.code for _ in range(20)]
     assert set(codes) == {ReasonCode.NO_ORIGIN}, "while it is asked again, too"
     assert len(autopilot.questions()) == 2
     autopilot.send(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
     autopilot.filter(mavlink.EKF_CONST_POS_MODE)
-    assert refused().why.code is ReasonCode.NO_ESTIMATE
-    assert refused(ACCEPTED).why is None
+    assert refuse_fix().why.code is ReasonCode.NO_ESTIMATE
+    assert refuse_fix(ACCEPTED).why is None
     assert autopilot.conversation.autopilot.acks == {"FAILED": 24, "ACCEPTED": 1}
     assert autopilot.conversation.fixes.refusal.code is ReasonCode.NO_ESTIMATE
 

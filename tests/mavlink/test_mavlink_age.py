@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 import serial
 from loopback import free_port, wait_until
-from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, link_to
+from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, make_link
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import parse_link
@@ -90,7 +90,7 @@ def test_serial_link_drops_outdated_fixes_after_a_stall():
     master, slave = pty.openpty()
     tty.setraw(slave)
     peer = Peer(SimpleNamespace(recv=partial(os.read, master), send=partial(os.write, master)), 7)
-    with link_to(f"serial:{os.ttyname(slave)}:57600", max_fix_age_s=0.2) as link:
+    with make_link(f"serial:{os.ttyname(slave)}:57600", max_fix_age_s=0.2) as link:
         peer.heartbeat()
         peer.synchronise(link)
         termios.tcflow(slave, termios.TCOOFF)
@@ -118,7 +118,7 @@ def count_losses(caplog) -> int:
 def test_serial_link_reopens_a_replugged_cable(tmp_path, caplog):
     cable = SerialCable(tmp_path)
     here, there = (f"serial:{end}:57600" for end in cable.ends)
-    with link_to(here) as link:
+    with make_link(here) as link:
         assert link.stats().trouble  # absent at the start: no error
         for times in (1, 2):
             cable.plug()
@@ -139,7 +139,7 @@ def test_serial_link_reopens_a_replugged_cable(tmp_path, caplog):
 def test_serial_link_opens_later_if_another_program_probes_the_device(tmp_path):
     """A modem manager opens what is plugged in: at the start that is said, in flight it is waited for."""
     device = tmp_path / "ttyACM0"
-    with link_to(f"serial:{device}:57600") as link:
+    with make_link(f"serial:{device}:57600") as link:
         assert link.stats().trouble
         master, slave = pty.openpty()
         tty.setraw(slave)

@@ -16,7 +16,7 @@ def beat(identity: Identity, speaker: Endpoint, *times_s: float) -> list[bool]:
     return [identity.admits(speaker, True, t_s) for t_s in times_s]
 
 
-def seconds(first: float, last: float) -> list[float]:
+def list_seconds(first: float, last: float) -> list[float]:
     """Every second from `first` to `last`."""
     return [first + count for count in range(round(last - first) + 1)]
 
@@ -24,12 +24,12 @@ def seconds(first: float, last: float) -> list[float]:
 def test_identity_keeps_the_first_autopilot_while_it_sends(caplog):
     identity = Identity()
     assert not identity.admits(OURS, False, 0.0), "what is no heartbeat makes nobody ours"
-    for t_s in seconds(0, 100):
+    for t_s in list_seconds(0, 100):
         assert identity.admits(OURS, True, t_s)
         assert not identity.admits(FOREIGN, True, t_s + 0.5)
         assert not identity.admits(FOREIGN, False, t_s + 0.6)
     assert identity.foreign_messages == 202
-    for t_s in seconds(101, 400):
+    for t_s in list_seconds(101, 400):
         assert not identity.admits(FOREIGN, True, t_s), "another system is never taken"
     assert identity.current == OURS
     assert caplog.text.count("system 2") == 1
@@ -38,7 +38,7 @@ def test_identity_keeps_the_first_autopilot_while_it_sends(caplog):
 def test_identity_accepts_the_same_system_elsewhere_after_thirty_seconds(caplog):
     identity = Identity()
     beat(identity, Endpoint(1, HERE), 0.0)
-    for t_s in seconds(20, 40):
+    for t_s in list_seconds(20, 40):
         assert beat(identity, Endpoint(7, THERE), t_s) == [False]
         assert beat(identity, Endpoint(1, THERE), t_s + 0.5) == [t_s >= 30]
         assert identity.has_moved == (t_s == 30)
@@ -48,11 +48,11 @@ def test_identity_accepts_the_same_system_elsewhere_after_thirty_seconds(caplog)
 
 def test_identity_keeps_a_configured_system_at_any_address(caplog):
     identity = Identity(system_id=1)
-    assert not any(beat(identity, Endpoint(2, HERE), *seconds(0, 99)))
+    assert not any(beat(identity, Endpoint(2, HERE), *list_seconds(0, 99)))
     assert identity.foreign_messages == 100
     assert caplog.text.count("system 1 ") == 1
     assert beat(identity, Endpoint(1, HERE), 100.0) == [True]
-    assert not any(beat(identity, Endpoint(2, HERE), *seconds(101, 200)))
+    assert not any(beat(identity, Endpoint(2, HERE), *list_seconds(101, 200)))
     assert beat(identity, Endpoint(1, THERE), 129.0, 130.0) == [False, True]
     assert identity.current == Endpoint(1, THERE)
 

@@ -8,7 +8,7 @@ from contextlib import closing
 
 import pytest
 from loopback import free_port, wait_until
-from mavlink_peers import Peer, TcpServer, UdpPort, link_to
+from mavlink_peers import Peer, TcpServer, UdpPort, make_link
 
 from edgevpr.mavlink.conversation import MAX_MESSAGES
 from edgevpr.mavlink.link import Link
@@ -18,7 +18,7 @@ from edgevpr.mavlink.wire import mavlink
 pytestmark = pytest.mark.network
 
 
-def fix_at(t_frame_s: float, lat_deg: float = 50.0) -> Fix:
+def make_fix(t_frame_s: float, lat_deg: float = 50.0) -> Fix:
     return Fix(lat_deg, 14.0, 25.0, t_frame_s)
 
 
@@ -54,7 +54,7 @@ def test_link_uses_and_addresses_the_autopilots_system_id(link, peer, clock):
     link.send(make_text("before"))
     assert peer.expect("STATUSTEXT").get_srcSystem() == 1
     connect_autopilot(link, peer)
-    link.send_fix(fix_at(clock.now_s - 0.5, 50.1234567))
+    link.send_fix(make_fix(clock.now_s - 0.5, 50.1234567))
     fix = peer.expect("COMMAND_INT")
     assert (fix.get_srcSystem(), fix.get_srcComponent()) == (7, 197)
     assert (fix.target_system, fix.target_component) == (7, 1)
@@ -64,12 +64,12 @@ def test_link_uses_and_addresses_the_autopilots_system_id(link, peer, clock):
 
 def test_link_never_sends_an_outdated_fix_or_one_to_a_silent_autopilot(link, peer, clock):
     connect_autopilot(link, peer)
-    link.send_fix(fix_at(clock.now_s - 5.1, 1.0))
-    link.send_fix(fix_at(clock.now_s - 4.9, 2.0))
+    link.send_fix(make_fix(clock.now_s - 5.1, 1.0))
+    link.send_fix(make_fix(clock.now_s - 4.9, 2.0))
     assert peer.expect("COMMAND_INT").x == 20_000_000
     assert link.stats().dropped_stale_fixes == 1
     clock.now_s += 5.1
-    link.send_fix(fix_at(clock.now_s))  # the autopilot has fallen silent
+    link.send_fix(make_fix(clock.now_s))  # the autopilot has fallen silent
     link.send(make_text("end"))
     assert "COMMAND_INT" not in [m.get_type() for m in peer.expect_text("end")]
     assert not link.stats().autopilot_heard
@@ -85,7 +85,7 @@ def test_udpout_link_accepts_only_its_peer(clock):
     with (
         closing(UdpPort()) as port,
         closing(UdpPort()) as stranger,
-        link_to(f"udpout:127.0.0.1:{port.number}", clock=clock) as link,
+        make_link(f"udpout:127.0.0.1:{port.number}", clock=clock) as link,
     ):
         peer = Peer(port)
         peer.expect("HEARTBEAT")
@@ -100,7 +100,7 @@ def test_udpout_link_accepts_only_its_peer(clock):
 def test_tcp_link_reconnects_to_a_restarted_server_without_old_fixes(clock):
     number = free_port()
     server = TcpServer(number)
-    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
+    with make_link(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         peer = Peer(server.accept())
         peer.expect("HEARTBEAT")
         connect_autopilot(link, peer)
@@ -109,9 +109,9 @@ def test_tcp_link_reconnects_to_a_restarted_server_without_old_fixes(clock):
         server.close()
         wait_until(lambda: not link.stats().connected, "noticing the loss")
         assert "closed" in link.stats().trouble
-        link.send_fix(fix_at(clock.now_s, 1.0))
+        link.send_fix(make_fix(clock.now_s, 1.0))
         clock.now_s += 0.8
-        link.send_fix(fix_at(clock.now_s, 2.0))
+        link.send_fix(make_fix(clock.now_s, 2.0))
         clock.now_s += 0.8
         server = TcpServer(number)
         peer = Peer(server.accept())
@@ -126,7 +126,7 @@ def test_tcp_link_reconnects_to_a_restarted_server_without_old_fixes(clock):
 
 def test_tcp_link_waits_for_an_absent_server_with_the_newest_messages(clock):
     number = free_port()
-    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
+    with make_link(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
         assert link.stats().trouble == "Connection refused"
         for count in range(MAX_MESSAGES + 36):
@@ -141,15 +141,15 @@ def test_tcp_link_waits_for_an_absent_server_with_the_newest_messages(clock):
 def test_tcp_link_is_never_blocked_by_a_peer_that_does_not_read(clock):
     number = free_port()
     server = TcpServer(number)
-    with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
+    with make_link(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         server.accept()
 
-        def stuck() -> bool:
+        def is_stuck() -> bool:
             link.send(*[make_text("x" * 50)] * MAX_MESSAGES)
             clock.now_s += 0.01
             return link.stats().trouble is not None
 
-        wait_until(stuck, "filling the line")
+        wait_until(is_stuck, "filling the line")
         trouble = link.stats().trouble
         assert trouble == os.strerror(errno.ETIMEDOUT) or "more bytes" in trouble
         peer = Peer(server.accept())
@@ -159,7 +159,7 @@ def test_tcp_link_is_never_blocked_by_a_peer_that_does_not_read(clock):
 
 
 def test_link_sends_nothing_once_closed_and_can_be_closed_twice(port, clock):
-    link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
+    link = make_link(f"udpout:127.0.0.1:{port.number}", clock=clock)
     link.start()
     link.send(make_text("last"))
     link.close()
@@ -167,13 +167,13 @@ def test_link_sends_nothing_once_closed_and_can_be_closed_twice(port, clock):
     link.send(make_text("late"))
     link.close()
     assert not link.stats().connected
-    link_to("udpout:127.0.0.1:14550").close()  # never started
+    make_link("udpout:127.0.0.1:14550").close()  # never started
 
 
 def test_link_waits_for_the_last_answer_while_closing(link, peer, clock):
     connect_autopilot(link, peer)
     peer.synchronise(link)
-    link.send_fix(fix_at(clock()))
+    link.send_fix(make_fix(clock()))
     closing_link = threading.Thread(target=link.close)
     closing_link.start()
     peer.expect("COMMAND_INT")

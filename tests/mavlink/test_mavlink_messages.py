@@ -23,7 +23,7 @@ STATE = MotionState(
 )
 
 
-def sent_and_received(message: Message) -> Message:
+def pack_and_unpack(message: Message) -> Message:
     """What the other end makes of it."""
     packed = message.pack(mavlink.MAVLink(None, 1, 197))
     (received,) = PacketReader().feed(packed)
@@ -35,7 +35,7 @@ def sent_and_received(message: Message) -> Message:
     [(50.12345678, 14.98765432), (-33.8688197, -151.2092955), (89.99999995, 179.99999995), (-90.0, -180.0), (0.0, 0.0)],
 )
 def test_make_position_fix_keeps_seven_decimals_and_no_altitude(lat_deg, lon_deg):
-    heard = sent_and_received(messages.make_position_fix(Fix(lat_deg, lon_deg, 25.0, 99.25), 100.5, target_system=7))
+    heard = pack_and_unpack(messages.make_position_fix(Fix(lat_deg, lon_deg, 25.0, 99.25), 100.5, target_system=7))
     assert heard.get_type() == "COMMAND_INT"
     assert (heard.command, heard.frame) == (43003, mavlink.MAV_FRAME_GLOBAL)
     assert (heard.target_system, heard.target_component) == (7, 1)
@@ -62,24 +62,24 @@ def test_fix_refuses_undefined_values(wrong, says):
 
 def test_make_named_values_sends_integers_and_floats_and_omits_unknown_values():
     named = messages.make_named_values(12.5, vpr_place=4711, vpr_score=0.625, vpr_conf=None)
-    heard = [(m.get_type(), m.name, m.value, m.time_boot_ms) for m in map(sent_and_received, named)]
+    heard = [(m.get_type(), m.name, m.value, m.time_boot_ms) for m in map(pack_and_unpack, named)]
     assert heard == [
         ("NAMED_VALUE_INT", "vpr_place", 4711, 12500),
         ("NAMED_VALUE_FLOAT", "vpr_score", 0.625, 12500),
     ]
     (cpu,) = messages.make_named_values(2**32 / 1000 + 1.5, vpr_cpu=0.25)
-    assert sent_and_received(cpu).time_boot_ms == 1500, "it wraps as its field does"
+    assert pack_and_unpack(cpu).time_boot_ms == 1500, "it wraps as its field does"
 
 
 def test_make_computer_status_reports_load_memory_and_temperature_and_marks_unknown_values():
-    heard = sent_and_received(messages.make_computer_status(60.0, [0.5, 1.25, 0.0], 512 << 20, 4096 << 20, 61.4))
+    heard = pack_and_unpack(messages.make_computer_status(60.0, [0.5, 1.25, 0.0], 512 << 20, 4096 << 20, 61.4))
     assert heard.cpu_cores == [50, 100, 0, 255, 255, 255, 255, 255]
     assert (heard.ram_usage, heard.ram_total) == (512, 4096)
     assert heard.temperature_core[:2] == [61, 127]
     assert heard.temperature_board == 127
     assert (heard.uptime, heard.time_usec) == (60_000, 60_000_000)
     assert set(heard.storage_total) == {2**32 - 1}
-    heard = sent_and_received(messages.make_computer_status(60.0, [0.1] * 20, 1 << 20, 1 << 30, None))
+    heard = pack_and_unpack(messages.make_computer_status(60.0, [0.1] * 20, 1 << 20, 1 << 30, None))
     assert (heard.cpu_cores, set(heard.temperature_core)) == ([10] * 8, {127})
 
 
@@ -93,7 +93,7 @@ def test_make_computer_status_reports_load_memory_and_temperature_and_marks_unkn
     ],
 )
 def test_make_status_text_truncates_to_one_message(text, arrives):
-    heard = sent_and_received(messages.make_status_text(Severity.WARNING, text))
+    heard = pack_and_unpack(messages.make_status_text(Severity.WARNING, text))
     assert heard.severity == mavlink.MAV_SEVERITY_WARNING
     assert heard.get_msgbuf()[11:-2].decode() == arrives
 
@@ -109,7 +109,7 @@ def test_make_report_requests_requests_only_the_reports_of_that_firmware(firmwar
 
 
 def test_make_gps_input_has_position_velocity_and_accuracy_or_no_fix():
-    heard = sent_and_received(messages.make_gps_input(STATE, 1, 100.0, 1_700_000_000.25))
+    heard = pack_and_unpack(messages.make_gps_input(STATE, 1, 100.0, 1_700_000_000.25))
     assert (heard.gps_id, heard.fix_type, heard.lat, heard.lon) == (1, 3, 471234567, 87654321)
     assert (heard.ve, heard.vn, heard.vd) == (3.0, -4.0, 0.5)
     assert (heard.horiz_accuracy, heard.vert_accuracy) == (2.5, 3.0)
@@ -119,14 +119,14 @@ def test_make_gps_input_has_position_velocity_and_accuracy_or_no_fix():
     assert (heard.time_week, heard.time_week_ms) == (2288, (2 * 86_400 + 80_000 + 18) * 1000 + 250)
     assert heard.satellites_visible < 10, "a real receiver is to be preferred"
     assert heard.yaw == 0, "which says nothing"
-    heard = sent_and_received(messages.make_gps_input(None, 0, 100.0, None))
+    heard = pack_and_unpack(messages.make_gps_input(None, 0, 100.0, None))
     assert (heard.gps_id, heard.fix_type, heard.satellites_visible) == (0, mavlink.GPS_FIX_TYPE_NO_FIX, 0)
     assert (heard.time_week, heard.time_week_ms) == (0, 0)
 
 
 def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airframe():
     origin = *offset_position(STATE.lat_deg, STATE.lon_deg, -200.0, 300.0), 500.0
-    heard = sent_and_received(messages.make_odometry(STATE, STATE.attitude, origin, 7.0))
+    heard = pack_and_unpack(messages.make_odometry(STATE, STATE.attitude, origin, 7.0))
     assert (heard.frame_id, heard.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     assert (heard.x, heard.y, heard.z) == pytest.approx((-300.0, 200.0, -12.3), abs=0.1)
     w, *axis = heard.q

@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing, suppress
 import pytest
 from conversing import Autopilot
 from loopback import free_port, wait_until
-from mavlink_peers import link_to
+from mavlink_peers import make_link
 
 from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import ConfigError
@@ -142,7 +142,7 @@ def test_signing_is_compatible_with_pymavlink(key_file, monkeypatch):
 
     number = free_port()
     signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
-    with link_to(f"udpin:127.0.0.1:{number}", signing=signing) as link:
+    with make_link(f"udpin:127.0.0.1:{number}", signing=signing) as link:
         other = mavutil.mavlink_connection(
             f"udpout:127.0.0.1:{number}", dialect="all", source_system=7, source_component=1
         )
@@ -168,7 +168,7 @@ def test_signing_autopilot_with_an_old_clock_learns_the_time_despite_an_earlier_
     """As after a flat battery of its clock: it takes ours from the first message that it gets, so it must get one."""
     number, day = free_port(), 86_400 * TICKS_S
     signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
-    with link_to(f"udpin:127.0.0.1:{number}", signing=signing) as link, ExitStack() as stack:
+    with make_link(f"udpin:127.0.0.1:{number}", signing=signing) as link, ExitStack() as stack:
         stray, own, replaying = (stack.enter_context(closing(make_socket(number))) for _ in range(3))
         stray.send(make_unsigned())
         wait_until(lambda: link.stats().refused_signatures, "the stray packet")

@@ -23,7 +23,7 @@ def command_int(number, p1=0.0, p2=0.0, to=US):
     return mavlink.MAVLink_command_int_message(*to, 0, number, 0, 0, p1, p2, 0, 0, 0, 0, 0)
 
 
-def reply_to(autopilot, *messages, sender=STATION):
+def collect_replies(autopilot, *messages, sender=STATION):
     """What comes for messages of the ground station."""
     autopilot.take_sent()
     for message in messages:
@@ -31,9 +31,9 @@ def reply_to(autopilot, *messages, sender=STATION):
     return autopilot.take_sent()
 
 
-def result_for(autopilot, message):
+def read_result(autopilot, message):
     """The result that the ground station gets for a command."""
-    (ack,) = reply_to(autopilot, message)
+    (ack,) = collect_replies(autopilot, message)
     assert (ack.get_type(), ack.get_srcSystem(), ack.get_srcComponent()) == ("COMMAND_ACK", *US)
     assert (ack.command, ack.target_system, ack.target_component) == (message.command, *STATION)
     assert (ack.progress, ack.result_param2) == (0, 0)
@@ -48,37 +48,37 @@ def requests(autopilot):
 
 def test_timesync_request_is_answered_by_the_clock_of_the_timestamps(autopilot):
     autopilot.clock.now_s = 1234.5
-    (answer,) = reply_to(autopilot, mavlink.MAVLink_timesync_message(tc1=0, ts1=987_654_321_012))
+    (answer,) = collect_replies(autopilot, mavlink.MAVLink_timesync_message(tc1=0, ts1=987_654_321_012))
     assert (answer.tc1, answer.ts1) == (1_234_500_000_000, 987_654_321_012)
-    assert reply_to(autopilot, mavlink.MAVLink_timesync_message(tc1=5, ts1=6)) == [], "an answer is not answered"
+    assert collect_replies(autopilot, mavlink.MAVLink_timesync_message(tc1=5, ts1=6)) == [], "an answer is not answered"
 
 
 @pytest.mark.parametrize("form", [command_long, command_int])
 @pytest.mark.parametrize("wish", list(UserCommand))
 def test_user_command_is_accepted_and_passed_on(autopilot, requests, form, wish):
-    assert result_for(autopilot, form(31010, wish)) == "ACCEPTED"
+    assert read_result(autopilot, form(31010, wish)) == "ACCEPTED"
     assert requests.take() == (wish, "255/190")
     assert requests.take() is None
 
 
 def test_pause_acknowledged_stops_all_fixes(autopilot, requests):
-    assert result_for(autopilot, command_long(31010, 1)) == "ACCEPTED"
+    assert read_result(autopilot, command_long(31010, 1)) == "ACCEPTED"
     held = autopilot.put_fix()
     assert (held.sent, held.why.code) == (False, ReasonCode.PAUSED)
-    assert result_for(autopilot, command_long(31010, 2)) == "ACCEPTED"
+    assert read_result(autopilot, command_long(31010, 2)) == "ACCEPTED"
     assert autopilot.put_fix().sent
 
 
 @pytest.mark.parametrize("to", [(0, 0), (7, 0), (0, 197), (7, 1), (8, 197), (7, 191)])
 def test_commands_to_another_address_are_ignored(autopilot, requests, to):
     commands = command_long(31010, 1, to=to), command_int(31010, 1, to=to), command_long(400, 1, to=to)
-    assert reply_to(autopilot, *commands) == []
+    assert collect_replies(autopilot, *commands) == []
     assert requests.take() is None
 
 
 def test_requests_that_claim_our_own_address_get_no_answer(autopilot):
     messages = mavlink.MAVLink_timesync_message(tc1=0, ts1=1), command_long(512, 148)
-    assert reply_to(autopilot, *messages, sender=US) == []
+    assert collect_replies(autopilot, *messages, sender=US) == []
 
 
 def test_requests_in_a_flood_are_answered_in_part_and_do_not_displace_our_messages(autopilot, requests):
@@ -91,7 +91,7 @@ def test_requests_in_a_flood_are_answered_in_part_and_do_not_displace_our_messag
     assert ours.text == "ours"
     assert [answer.ts1 for answer in answers] == list(range(MAX_ANSWERS_PER_S))
     autopilot.wait(1.0)
-    assert result_for(autopilot, command_long(31010, 1)) == "ACCEPTED"
+    assert read_result(autopilot, command_long(31010, 1)) == "ACCEPTED"
 
 
 def react(message, sender=STATION):

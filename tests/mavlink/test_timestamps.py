@@ -88,10 +88,10 @@ def test_time_stamps_continue_on_a_full_disk(path, monkeypatch, caplog):
     clock = FakeClock()
     stamps = make_stamps(path, clock=clock)
 
-    def full(*_):
+    def raise_disk_full(*_):
         raise OSError(28, "disk full")
 
-    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", full)
+    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", raise_disk_full)
     tries = []
     monkeypatch.setattr("edgevpr.mavlink.signing.Thread.start", lambda thread: tries.append(thread.run()))
     first = stamps.next()

@@ -37,11 +37,11 @@ def test_matchability_keeps_an_image_but_not_darkness_fog_or_blank_images():
     ground = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, (480, 640)), (0, 0), 2)
     ground = np.clip(128 + 45 * ground / ground.std(), 0, 255)
 
-    def worth(picture):
+    def score_picture(picture):
         seen = picture + np.random.default_rng(2).normal(0, 6, picture.shape)  # by a sensor
         return network.compute_matrix(np.clip(seen, 0, 255).astype(np.uint8)).mean()
 
     least = load_config(None).salience.memorability
-    assert worth(ground) > least
+    assert score_picture(ground) > least
     for spoilt in (0.04 * ground, 200 + 0.05 * (ground - 128), np.full_like(ground, 90)):
-        assert worth(spoilt) < least
+        assert score_picture(spoilt) < least

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 import train_words
-from pictures import textured, write_flight
+from pictures import draw_texture, write_flight
 from training_pictures import read_pictures
 
 from edgevpr import techniques
@@ -25,7 +25,7 @@ def own_models(models, monkeypatch):
 @pytest.fixture
 def folder(tmp_path):
     """Twelve pictures."""
-    write_flight(tmp_path / "pictures", map(textured, range(12)))
+    write_flight(tmp_path / "pictures", map(draw_texture, range(12)))
     return tmp_path / "pictures"
 
 

@@ -13,7 +13,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
 
 
-def layers(path, shown):
+def make_layers(path, shown):
     """The layers of a map of places that show so much ground; `shown` has (footprint_m, is_surveyed) of each."""
     with PlaceMap.create(path, SPEC) as place_map:
         for number, (footprint_m, is_surveyed) in enumerate(shown, start=1):
@@ -27,19 +27,19 @@ CUT = [(150.0, True), (100.0, True), (102.0, True), (150.0, True), (300.0, False
 
 
 def test_layers_are_one_per_footprint_of_the_map(tmp_path):
-    assert layers(tmp_path / "a.gpkg", CUT).footprints_m == (100.0, 150.0)
-    assert layers(tmp_path / "b.gpkg", CUT[1:3]).footprints_m == (101.0,), "as good as one"
-    assert layers(tmp_path / "c.gpkg", [(80.0, False), (160.0, False), (90.0, False)]).footprints_m == (90.0,)
-    assert layers(tmp_path / "d.gpkg", []).footprints_m == ()
+    assert make_layers(tmp_path / "a.gpkg", CUT).footprints_m == (100.0, 150.0)
+    assert make_layers(tmp_path / "b.gpkg", CUT[1:3]).footprints_m == (101.0,), "as good as one"
+    assert make_layers(tmp_path / "c.gpkg", [(80.0, False), (160.0, False), (90.0, False)]).footprints_m == (90.0,)
+    assert make_layers(tmp_path / "d.gpkg", []).footprints_m == ()
 
 
 @pytest.mark.parametrize(("seen_m", "among_m"), [(60, 100), (125, 100), (150, 150), (400, 150), (None, None)])
 def test_choose_footprint_prefers_slightly_smaller_places(tmp_path, seen_m, among_m):
-    assert layers(tmp_path / "m.gpkg", CUT).choose_footprint(seen_m) == among_m
+    assert make_layers(tmp_path / "m.gpkg", CUT).choose_footprint(seen_m) == among_m
 
 
 def test_narrow_search_excludes_places_of_other_footprints(tmp_path):
-    found = layers(tmp_path / "m.gpkg", CUT)
+    found = make_layers(tmp_path / "m.gpkg", CUT)
     whole = make_index([1, 2, 3, 4, 5, 9])  # 9 was learnt since
     assert found.narrow_search(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
     assert found.narrow_search(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
@@ -51,4 +51,4 @@ def test_narrow_search_excludes_places_of_other_footprints(tmp_path):
 
 def test_narrow_search_keeps_all_places_of_a_single_layer(tmp_path):
     expected = Expectation()
-    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow_search(expected, make_index([1, 2]), 300.0) is expected
+    assert make_layers(tmp_path / "m.gpkg", CUT[1:3]).narrow_search(expected, make_index([1, 2]), 300.0) is expected

@@ -35,13 +35,13 @@ def test_step_does_not_mask_an_exception_before_its_cost_is_set():
 
     calls = []
 
-    def counted():
+    def read_clock():
         calls.append(1)
         if len(calls) == 2:  # the first is of the beginning of the step
             raise Ended
         return 0.0
 
-    meter = QueryMeter(load_board("generic-x86"), wall_clock=counted)
+    meter = QueryMeter(load_board("generic-x86"), wall_clock=read_clock)
     meter.begin()
     with pytest.raises(Ended), meter.step("encode"):
         pass

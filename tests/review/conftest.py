@@ -3,9 +3,9 @@
 import pytest
 from browser import launch_browser
 from commands import run
-from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
+from fakes import FakeClock, FakeLink, FakeSource, make_receiver, make_vehicle
 from flights import Flight
-from pictures import textured, write_flight
+from pictures import draw_texture, write_flight
 
 from edgevpr.core.types import Frame
 from edgevpr.runtime.flight.startup import start_fields
@@ -20,7 +20,7 @@ def flight_folder(tmp_path_factory):
     """A folder with a flight.jsonl, its map.gpkg, the pictures of the map (`ref`) and of the flight (`seen`), which
     have the same names. The GPS of the aircraft is 90 m beside the map's positions."""
     folder = tmp_path_factory.mktemp("flown")
-    pictures = {f"{number}.png": textured(number, 240, 320) for number in range(QUERY_COUNT)}
+    pictures = {f"{number}.png": draw_texture(number, 240, 320) for number in range(QUERY_COUNT)}
     write_flight(folder / "ref", list(pictures.values())[:PLACES], STEP_DEG)
     write_flight(folder / "seen", [255 - picture for picture in pictures.values()])
     flags = ["--technique", "cohog", "--param", "w1=208", "--no-calibrate"]
@@ -30,8 +30,8 @@ def flight_folder(tmp_path_factory):
 
     def vehicle():
         lat_deg = 50 + STEP_DEG * (clock() - 1000)
-        receiver = receiver_at((lat_deg, 8.00126), 1.0, clock())
-        return vehicle_at(lat_deg, 8.0, clock(), heading_deg=0.0, has_gps=False, gps=receiver)
+        receiver = make_receiver((lat_deg, 8.00126), 1.0, clock())
+        return make_vehicle(lat_deg, 8.0, clock(), heading_deg=0.0, has_gps=False, gps=receiver)
 
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(folder / "map.gpkg", folder / "flight.jsonl", clock, link, **{"source.rate_hz": 1.0})

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from logs import query
-from pictures import rough_ground
+from pictures import draw_rough_ground
 
 from edgevpr.core.geodesy import offset_position, picture_axes
 from edgevpr.core.types import Place, Pose, Position
@@ -23,7 +23,7 @@ UNCERTAIN = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "min_c
 
 def make_landscape() -> np.ndarray:
     """The ground, BGR, a metre `METRE_PX` pixels, with ORIGIN in its middle and north up."""
-    seen = rough_ground(560)
+    seen = draw_rough_ground(560)
     return np.dstack((seen, 255 - seen, seen // 2))
 
 

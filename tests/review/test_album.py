@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 from ground import write_places
-from rasters import HOME, textured_raster
+from rasters import HOME, write_textured_raster
 
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
@@ -31,7 +31,7 @@ def test_make_map_album_cuts_the_pictures_of_an_orthophoto_again(tmp_path):
     pytest.importorskip("rasterio")
     pose = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
     places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
-    album = make_map_album([textured_raster(tmp_path / "town.tif")], places)
+    album = make_map_album([write_textured_raster(tmp_path / "town.tif")], places)
     assert album.find_image("town.tif_r000_c000").std() > 10
     assert album.find_image("town.tif_r000_c001") is None
     assert album.align_picture(places[0], None).image.std() > 10

@@ -4,8 +4,8 @@ from dataclasses import replace
 from shutil import copyfile
 
 import pytest
-from browser import data_of, open_page
-from commands import refused
+from browser import open_page, read_page_data
+from commands import expect_refusal
 from ground import STEP_M, position, write_places
 
 from edgevpr.cli.main import main
@@ -45,7 +45,7 @@ def test_map_page_shows_places_and_their_problems(browser, folder):
     out = folder / "map.html"
     argv = ["map", "info", folder / "valley.gpkg", "--page", out, "--map-images", folder / "ref"]
     assert main(list(map(str, argv))) == 0
-    data = data_of(out.read_text("utf-8"))
+    data = read_page_data(out.read_text("utf-8"))
     alike = {step["title"]: step["texts"][-1] for step in data["steps"] if "looks like" in step["texts"][-1]}
     assert "place 13: " in alike["Place 6: 05.png"]
     assert "place 6: " in alike[f"Place 13: {TWIN}"]
@@ -68,7 +68,9 @@ def test_map_page_shows_places_and_their_problems(browser, folder):
 @pytest.mark.slow
 def test_map_page_is_never_written_over_the_map(folder, capsys):
     before = (folder / "valley.gpkg").read_bytes()
-    assert "another output" in refused(capsys, "map", "info", folder / "valley.gpkg", "--page", folder / "valley.gpkg")
+    assert "another output" in expect_refusal(
+        capsys, "map", "info", folder / "valley.gpkg", "--page", folder / "valley.gpkg"
+    )
     assert (folder / "valley.gpkg").read_bytes() == before
 
 

@@ -5,8 +5,8 @@ import base64
 import cv2
 import numpy as np
 import pytest
-from browser import data_of
-from commands import refused, run
+from browser import read_page_data
+from commands import expect_refusal, run
 from logs import query, write_log
 
 from edgevpr.review.album import Album, make_album
@@ -29,7 +29,7 @@ def report_page(flight_folder, tmp_path_factory):
 
 
 def test_make_flight_page_of_a_real_flight_has_all_parts(report_page):
-    data = data_of(report_page.read_text("utf-8"))
+    data = read_page_data(report_page.read_text("utf-8"))
     assert "longest time without a match" in dict(data["figures"])
     assert {"places", "accepted", "taken", "autopilot", "gps"} <= {each["colour"] for each in data["ground"]["layers"]}
     drawn = [chart["title"] for chart in data["charts"] if any(points for *_, points in chart["series"])]
@@ -39,7 +39,7 @@ def test_make_flight_page_of_a_real_flight_has_all_parts(report_page):
 
 
 def test_flight_page_shows_query_and_match_side_by_side_though_their_pictures_have_one_name(report_page, flight_folder):
-    data = data_of(report_page.read_text("utf-8"))
+    data = read_page_data(report_page.read_text("utf-8"))
     (seen_as, seen), (found_as, found) = (
         (caption, cv2.imdecode(np.frombuffer(base64.b64decode(data["pictures"][at].partition(",")[2]), np.uint8), 0))
         for caption, at in data["steps"][2]["pictures"]
@@ -71,24 +71,24 @@ def test_flight_page_treats_names_in_the_log_as_text(tmp_path):
     content = page(log)
     assert content.count("<script") == 2, "the data and the script of the page"
     assert "<img" not in content
-    assert "<script>alert(1)</script>" in data_of(content)["steps"][0]["title"]
+    assert "<script>alert(1)</script>" in read_page_data(content)["steps"][0]["title"]
     assert not {"\x1b", "\u202e"} & set(content)
 
 
 def test_flight_page_keeps_positions_across_the_date_line_together(tmp_path):
     at = [{"position": None, "fix": None, "located": {"lat_deg": 0.0, "lon_deg": lon}} for lon in (179.999, -179.999)]
-    data = data_of(page(write_log(tmp_path / "log", *(("query", query("a", **each)) for each in at))))
+    data = read_page_data(page(write_log(tmp_path / "log", *(("query", query("a", **each)) for each in at))))
     assert data["ground"]["box"][2] == pytest.approx(222.6 + 2 * 30, rel=0.01)
 
 
 def test_report_writes_a_page_without_the_map(flight_folder, tmp_path):
     log = write_log(tmp_path / "log", ("start", {"map": str(tmp_path / "gone.gpkg")}), ("query", query("a")))
     assert run("report", log, "--out", tmp_path / "out.html") == 0
-    data = data_of((tmp_path / "out.html").read_text("utf-8"))
+    data = read_page_data((tmp_path / "out.html").read_text("utf-8"))
     assert "not drawn" in data["warnings"][-1]
     assert data["ground"]["layers"]
     assert run("report", log, "--out", tmp_path / "out.html", "--map", flight_folder / "map.gpkg") == 0
-    data = data_of((tmp_path / "out.html").read_text("utf-8"))
+    data = read_page_data((tmp_path / "out.html").read_text("utf-8"))
     assert data["ground"]["layers"][0]["colour"] == "places"
 
 
@@ -108,6 +108,6 @@ def test_report_refuses_an_impossible_request_in_one_sentence(tmp_path, monkeypa
     write_log(tmp_path / "LOG", ("query", query("a")))
     (tmp_path / "empty").touch()
     before = (tmp_path / "LOG").read_bytes()
-    assert said in refused(capsys, "report", *argv, code=code)
+    assert said in expect_refusal(capsys, "report", *argv, code=code)
     assert (tmp_path / "LOG").read_bytes() == before
     assert not (tmp_path / "out.html").exists()

@@ -1,7 +1,7 @@
 """The page as its reader moves it, in a real browser: slider, ground, filter."""
 
 import pytest
-from browser import data_of, open_page
+from browser import open_page, read_page_data
 from ground import make_flight_lines, write_places
 from logs import query, write_log
 
@@ -38,7 +38,7 @@ def page(browser, page_path):
 
 
 def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, page_path):
-    steps = data_of(page_path.read_text("utf-8"))["steps"]
+    steps = read_page_data(page_path.read_text("utf-8"))["steps"]
     page.focus("#step")
     seen = set()
     for at in range(3):

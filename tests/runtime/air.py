@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-from fakes import receiver_at, vehicle_at
+from fakes import make_receiver, make_vehicle
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_m, offset_position
@@ -220,11 +220,11 @@ class SimFlight:
             self.known = GPS_SD_M, self.t_s
         sd_m = math.hypot(self.known[0], _DRIFT_M_S * (self.t_s - self.known[1]))
         roll_deg, pitch_deg = self.attitude
-        self.vehicle = vehicle_at(
+        self.vehicle = make_vehicle(
             *here,
             self.t_s,
             has_gps=self.has_gps,
-            gps=receiver_at(there, GPS_SD_M, self.t_s) if self.has_receiver else None,
+            gps=make_receiver(there, GPS_SD_M, self.t_s) if self.has_receiver else None,
             velocity_m_s=tuple(velocity + wrong),
             position_sd_m=None if self.knows_nothing else sd_m,
             height_m=100.0,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from fakes import FakeClock, FakeLink
-from flights import PLACES, STEP_DEG, flight_over, pictures
+from flights import PLACES, STEP_DEG, pictures, prepare_flight
 from pictures import write_flight
 
 from edgevpr.cli.main import main
@@ -52,7 +52,7 @@ def link(clock):
 @pytest.fixture
 def make_flight(recording, tmp_path, link, clock):
     """Make a flight with `link` by `clock`, a query a second: `make_flight("cohog", **settings)`."""
-    return partial(flight_over, recording, tmp_path, link, clock)
+    return partial(prepare_flight, recording, tmp_path, link, clock)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from fakes import FakeClock, FakeLink, FakeSource
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
@@ -80,14 +80,16 @@ class Flight:
         return lines
 
 
-def flight_over(folder: Path, tmp_path: Path, link: FakeLink | None, clock: FakeClock, technique="cohog", **settings):
+def prepare_flight(
+    folder: Path, tmp_path: Path, link: FakeLink | None, clock: FakeClock, technique="cohog", **settings
+):
     """A flight of a query a second with the map of a technique."""
     settings = {"source.rate_hz": 1.0} | settings
     return Flight(folder / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
 
 
 def pictures(count: int, first: int = 0) -> list[Image]:
-    return [textured(first + number, 240, 320) for number in range(count)]
+    return [draw_texture(first + number, 240, 320) for number in range(count)]
 
 
 def make_meter(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:
@@ -96,7 +98,7 @@ def make_meter(config: Config, recogniser: Recogniser, clock: FakeClock) -> Quer
     return QueryMeter(board, config.battery, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
-def flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) -> FlightMeter:
+def make_flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) -> FlightMeter:
     """A meter of the flight as a whole, for a test that looks into it."""
     return kind(flight.config.battery, flight.board, flight.clock.clock, **more)
 
@@ -113,6 +115,6 @@ def fly_acts(place_map: Path, log: Path, acts) -> tuple[list[dict], list[dict], 
     """Fly over the first places of a map, an act before each frame. Returns the queries, all lines, and the flight."""
     clock, calls = FakeClock(), iter(acts)
     flight = Flight(place_map, log, clock, FakeLink(clock), **{"source.rate_hz": 1.0})
-    seen = [textured(number % PLACES, 240, 320) for number in range(len(acts))]
+    seen = [draw_texture(number % PLACES, 240, 320) for number in range(len(acts))]
     lines = flight.fly(FakeSource(seen, clock, work=lambda: next(calls)()))
     return select(lines, "query"), lines, flight

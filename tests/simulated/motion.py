@@ -98,7 +98,7 @@ class Hover(Motion):
         self._offset_m += self._velocity_m_s * dt_s + self._acceleration_m_s2 * dt_s**2 / 2
         self._velocity_m_s += self._acceleration_m_s2 * dt_s
         lat_deg, lon_deg = displace((self._home.lat_deg, self._home.lon_deg), self._offset_m)
-        roll_deg, pitch_deg = tilt_for(self._acceleration_m_s2, self._heading_deg)
+        roll_deg, pitch_deg = compute_tilt(self._acceleration_m_s2, self._heading_deg)
         return TrueState(
             lat_deg=lat_deg,
             lon_deg=lon_deg,
@@ -177,7 +177,7 @@ def interpolate_track(track: FlownTrack, t_s: float) -> TrueState:
     return replace(passed, **values, velocity_m_s=velocity_m_s, t_s=t_s)
 
 
-def tilt_for(acceleration_m_s2: complex, heading_deg: float) -> tuple[float, float]:
+def compute_tilt(acceleration_m_s2: complex, heading_deg: float) -> tuple[float, float]:
     """Return the roll and pitch in degrees of a vehicle that only thrusts along its vertical axis, and accelerates
     horizontally by this much at constant height."""
     ahead = acceleration_m_s2 * cmath.rect(1.0, math.radians(heading_deg))  # 1j * forward + right

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from edgevpr.mavlink.wire import Message, mavlink
 from simulated.firmware import Firmware
-from simulated.motion import GRAVITY_M_S2, TrueState, tilt_for
+from simulated.motion import GRAVITY_M_S2, TrueState, compute_tilt
 from simulated.sensors import NOTHING, PositionMeasurement
 
 Report = Callable[[Firmware], Message | None]
@@ -51,7 +51,7 @@ def _attitude(brain: Firmware) -> Message | None:
     truth = brain.truth
     roll_deg, pitch_deg = truth.roll_deg, truth.pitch_deg
     if brain.tilt:
-        roll_deg, pitch_deg = tilt_for(truth.acceleration_m_s2 + GRAVITY_M_S2 * brain.tilt, truth.heading_deg)
+        roll_deg, pitch_deg = compute_tilt(truth.acceleration_m_s2 + GRAVITY_M_S2 * brain.tilt, truth.heading_deg)
     if math.isnan(roll_deg + pitch_deg):  # the track does not say
         return None
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 from loopback import free_port, wait_until
-from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to
+from mavlink_peers import AutopilotThread, Peer, UdpPort, make_link
 
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
@@ -20,7 +20,7 @@ from simulated.motion import TrueState, read_track
 pytestmark = pytest.mark.network
 
 
-def a_fix(**changes):
+def make_fix(**changes):
     command = messages.make_position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
     for field, value in changes.items():
         setattr(command, field, value)
@@ -42,13 +42,13 @@ def test_run_autopilot_answers_and_counts():
     assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
     assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     results = []
-    for command in (a_fix(x=501234567), a_fix(z=3.0), a_fix(command=31_000)):
+    for command in (make_fix(x=501234567), make_fix(z=3.0), make_fix(command=31_000)):
         send(command)
         results.append(companion.expect("COMMAND_ACK").result)
     assert results == [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED]
-    send(a_fix(target_system=2))  # for another vehicle: no answer
+    send(make_fix(target_system=2))  # for another vehicle: no answer
     companion.lose(3, component_id=197)
-    send(a_fix(x=501234568))
+    send(make_fix(x=501234568))
     assert companion.expect("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED
     assert not companion.seen
     summary = autopilot.finish()
@@ -70,7 +70,7 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
             assert read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
             there = asking.request_message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
         assert there.lat / 1e7 == 50.0
-        with link_to(f"udpout:{link}") as flight:
+        with make_link(f"udpout:{link}") as flight:
             wait_until(lambda: flight.stats().autopilot_heard)
             flight.send(*messages.make_named_values(time.monotonic(), vpr_place=3, vpr_score=0.5))
             wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")

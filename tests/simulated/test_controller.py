@@ -11,7 +11,7 @@ from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from simulated.controller import FlightController
-from simulated.motion import GRAVITY_M_S2, AlongTrack, Hover, Motion, TrueState, displace, tilt_for
+from simulated.motion import GRAVITY_M_S2, AlongTrack, Hover, Motion, TrueState, compute_tilt, displace
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 DENIED = mavlink.MAV_RESULT_DENIED
@@ -296,7 +296,7 @@ def test_px4_stops_fusing_a_spoofed_receiver_after_seven_seconds():
 def test_accelerometers_and_attitude_show_the_acceleration_and_the_tilt(acceleration_m_s2):
     controller = FlightController("px4-copter", Hover(ORIGIN, 60.0), gps=True)
     brain, tilt = controller.brain, 0.02 + 0.01j
-    roll_deg, pitch_deg = tilt_for(acceleration_m_s2, 30.0)
+    roll_deg, pitch_deg = compute_tilt(acceleration_m_s2, 30.0)
     brain.truth = TrueState(
         lat_deg=47.0, lon_deg=8.0, alt_m=0.0, roll_deg=roll_deg, pitch_deg=pitch_deg, heading_deg=30.0,
         acceleration_m_s2=acceleration_m_s2,

@@ -28,7 +28,7 @@ _PROCESSORS = {
 }
 
 
-def whole_numbers():
+def draw_integers():
     """A picture made of whole numbers alone, 480 x 640."""
     y, x = np.mgrid[:480, :640]
     return ((x * x // 97 + y * y // 61 + x * y // 173 + (x // 9 * 37 ^ y // 7 * 29)) % 256).astype(np.uint8)
@@ -37,10 +37,10 @@ def whole_numbers():
 def make_dim_picture():
     """A picture with few grey levels, which is stretched."""
     y, x = np.mgrid[:480, :640]
-    return (60 + whole_numbers() // 24 + (x // 40 + y // 30 * 3) % 17).astype(np.uint8)
+    return (60 + draw_integers() // 24 + (x // 40 + y // 30 * 3) % 17).astype(np.uint8)
 
 
-PICTURES = {"ordinary": whole_numbers, "dim": make_dim_picture}
+PICTURES = {"ordinary": draw_integers, "dim": make_dim_picture}
 CHECKSUMS = {
     "forward, ordinary": "3849885506 598602243 4103587366 2563522183",
     "nadir, ordinary": "959436069 1475824441 556021769 4160277071",
@@ -69,7 +69,7 @@ def print_checksums():
     for camera, kind in itertools.product(("forward", "nadir"), PICTURES):
         descriptor = create("cohog", {"camera": camera}).encode(PICTURES[kind]())
         print_crc(f"{camera}, {kind}", descriptor.coarse, descriptor.fine, descriptor.regions, descriptor.good)
-    picture, forward = whole_numbers(), create("cohog")
+    picture, forward = draw_integers(), create("cohog")
     print_crc("packed", forward.pack(forward.encode(picture).coarse[None], np.full((12, 12, 8), 90.0, np.float32)))
     rule = {"layout": "NCHW", "height": 512, "width": 512, "colour": "grey", "equalise": False, "resize": "linear"}
     print_crc("seen by a network", prepare_input(picture, InputRule(**rule, scale=1.0, mean=[0.0])).astype(np.uint8))
@@ -88,5 +88,5 @@ def test_descriptors_are_identical_on_any_processor(processor):
 def test_warp_picture_is_identical_for_rotated_queries():
     """Where there is FMA: without it some pixels differ, which no map holds."""
     technique = create("cohog", {"camera": "nadir"})
-    turned, allowed, _ = technique._make_views(technique.encode(whole_numbers()))._warp_picture(1.0, 5)
+    turned, allowed, _ = technique._make_views(technique.encode(draw_integers()))._warp_picture(1.0, 5)
     assert (zlib.crc32(turned), zlib.crc32(allowed)) == (1188350251, 19798888)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from tiny_networks import CARD, write_card, write_network
 
 from edgevpr import techniques
@@ -82,7 +82,7 @@ def test_create_makes_a_technique_from_a_card(models):
     assert techniques.read_parameters("mine") == {"form": "float", "threads": 1}
     technique = techniques.create("mine")
     assert (technique.spec.name, technique.spec.parameters) == ("mine", {})
-    image = textured(1)
+    image = draw_texture(1)
     expected = open_backbone("mine", "descriptor").run(image)
     found = technique.encode(image).coarse.astype(np.float32)
     np.testing.assert_allclose(found, expected / np.linalg.norm(expected), atol=1e-3)

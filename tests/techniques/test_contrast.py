@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.techniques import create
 from edgevpr.techniques.contrast import stretch_contrast
@@ -14,7 +14,7 @@ DOUBLED = (100, 200, 0.3)
 PIXEL_PX = (512 / 640, 512 / 480)
 
 
-def noisy(picture, sigma, seed=1):
+def add_noise(picture, sigma, seed=1):
     """What a sensor makes of it: uint8."""
     noise = sigma * np.random.default_rng(seed).normal(size=np.shape(picture))
     return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
@@ -29,8 +29,8 @@ def ramp(low, high):
 @pytest.mark.parametrize("worse", WORSE)
 def test_ground_in_little_light_and_in_fog_is_found(camera, worse):
     technique = create("cohog", {"camera": camera})
-    places = [technique.encode(textured(seed, 480, 640)).fine for seed in range(3)]
-    query = technique.encode(noisy(WORSE[worse](textured(1, 480, 640)), 1.5))
+    places = [technique.encode(draw_texture(seed, 480, 640)).fine for seed in range(3)]
+    query = technique.encode(add_noise(WORSE[worse](draw_texture(1, 480, 640)), 1.5))
     scores = [technique.match(query, place).score for place in places]
     assert query.quality >= 0.8
     assert scores[1] > max(technique.min_score, 2 * scores[0], 2 * scores[2])
@@ -42,7 +42,7 @@ def test_ground_in_little_light_and_in_fog_is_found(camera, worse):
 def test_stretch_contrast_does_not_turn_sensor_noise_into_ground(camera, size, level):
     technique = create("cohog", {"camera": camera})
     for sigma in (0, 1, 3):
-        assert technique.encode(noisy(np.full(size, level), sigma)).quality < technique.min_quality
+        assert technique.encode(add_noise(np.full(size, level), sigma)).quality < technique.min_quality
 
 
 def test_stretch_contrast_stretches_low_contrast_more_and_continuously():
@@ -59,7 +59,7 @@ def test_stretch_contrast_stretches_low_contrast_more_and_continuously():
 
 
 def test_make_grey_square_ignores_masked_pixels():
-    dim = make_grey_square(noisy(0.15 * textured(1, 480, 640), 1), 512)
+    dim = make_grey_square(add_noise(0.15 * draw_texture(1, 480, 640), 1), 512)
     allowed = np.ones((512, 512), bool)
     allowed[200:300, 100:400] = False
     changed = np.where(allowed, dim, np.float32(255))

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import create
 from edgevpr.techniques.displacement import find_displacement, fit_alignment, measure_support
 
 
-def count_by_hand(asking, best, side, counts):
+def count_votes(asking, best, side, counts):
     """Every possible step in turn, every vote in turn: the most that the votes about any step count for."""
     steps = [(b % side - a % side, b // side - a // side) for a, b in zip(asking, best, strict=True)]
     worth, most = dict(enumerate(counts)), 0
@@ -26,9 +26,7 @@ def test_find_displacement_counts_votes_around_the_most_frequent_displacement(co
     rng = np.random.default_rng(len(counts))
     asking = np.sort(rng.choice(49, 40, replace=False))
     best = rng.integers(0, 49, 40)
-    assert find_displacement(asking, best, (7, 7), counts).score == pytest.approx(
-        count_by_hand(asking, best, 7, counts)
-    )
+    assert find_displacement(asking, best, (7, 7), counts).score == pytest.approx(count_votes(asking, best, 7, counts))
 
 
 def test_find_displacement_refines_the_peak_within_a_cell():
@@ -43,12 +41,12 @@ def test_find_displacement_refines_the_peak_within_a_cell():
 
 def test_cohog_finds_how_far_a_picture_has_moved():
     technique = create("cohog")
-    scene = textured(1, 640, 704)
+    scene = draw_texture(1, 640, 704)
     reference = technique.encode(scene[:512, :512])
     moved = technique.encode(scene[32:544, 64:576])  # 4 cells to the right, 2 down
     match = technique.match(moved, reference.fine)
     assert match.shift_cells == pytest.approx((4.0, 2.0), abs=0.3)
-    stranger = technique.encode(textured(2, 512, 512))
+    stranger = technique.encode(draw_texture(2, 512, 512))
     assert match.score > 0.4 > 0.2 > technique.match(stranger, reference.fine).score
 
 
@@ -59,13 +57,13 @@ def test_find_displacement_counts_a_region_that_resembles_many_once():
     assert found.score == pytest.approx(6 / 7)
 
 
-def support_by_hand(asking, regions, reference, step):
+def compute_support(asking, regions, reference, step):
     """Every region in turn: back, likeness and log rank of a step."""
     side = math.isqrt(len(reference))
     best = [max(range(len(reference)), key=lambda r: float(regions[q] @ reference[r])) for q in range(len(asking))]
     back = [max(range(len(asking)), key=lambda q: float(regions[q] @ reference[r])) for r in range(len(reference))]
 
-    def along(q, r):
+    def is_shifted(q, r):
         off_x = r % side - asking[q] % side - round(step[0])
         off_y = r // side - asking[q] // side - round(step[1])
         return max(abs(off_x), abs(off_y)) <= 3
@@ -79,7 +77,7 @@ def support_by_hand(asking, regions, reference, step):
         there = max(float(regions[q] @ reference[j * side + i]) for j, i in around)
         log_ranks.append(math.log(1 + sum(float(regions[q] @ each) > there for each in reference)))
     return (
-        sum(along(back[r], r) for r in range(len(reference))) / len(reference),
+        sum(is_shifted(back[r], r) for r in range(len(reference))) / len(reference),
         sum(float(regions[q] @ reference[best[q]]) for q in range(len(asking))) / len(asking),
         sum(log_ranks) / len(log_ranks) if log_ranks else math.log(len(reference)),
     )
@@ -96,7 +94,7 @@ def test_support_is_computed_from_all_regions(step, asked):
     regions = (regions + rng.integers(-2, 3, regions.shape)).astype(np.float32)
     best = (regions @ reference.T).argmax(axis=1)
     found = measure_support(asking, regions, reference, best, step)
-    expected = support_by_hand(asking.tolist(), regions, reference, step)
+    expected = compute_support(asking.tolist(), regions, reference, step)
     assert (found.back, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
 
 

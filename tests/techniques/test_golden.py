@@ -5,7 +5,7 @@ from functools import cache
 import literal
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.techniques import create, entropy
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_filled_bins_is_the_printed_algorithm(seed):
-    image = textured(seed, 70, 45)
+    image = draw_texture(seed, 70, 45)
     np.testing.assert_allclose(entropy.compute_filled_bins(image), literal.filled_bins(image), atol=1e-6)
 
 
@@ -24,13 +24,13 @@ def test_filled_bins_of_radius_5_tops_out_below_one():
 
 
 def test_shannon_entropy_equals_that_of_the_disc():
-    image = textured(4, 128, 128)
+    image = draw_texture(4, 128, 128)
     np.testing.assert_allclose(entropy.compute_shannon(image), literal.shannon(image), atol=1e-5)
 
 
 @cache  # these loops are slow
 def literal_grey(seed):
-    return literal.grey_square(textured(seed), 208)
+    return literal.grey_square(draw_texture(seed), 208)
 
 
 @cache
@@ -46,7 +46,7 @@ def literal_entropy(seed, which):
 @pytest.mark.parametrize(("which", "threshold"), [("filled_bins", 0.5), ("shannon", 0.4), ("shannon", 0.55)])
 def test_cohog_descriptor_good_regions_and_score(which, threshold):
     technique = create("cohog", {"w1": 208, "w2": 16, "gt": threshold, "entropy": which, "matching": "thesis"})
-    query, reference = technique.encode(textured(6)), technique.encode(textured(7))
+    query, reference = technique.encode(draw_texture(6)), technique.encode(draw_texture(7))
 
     good = literal.good_blocks(literal_entropy(6, which), 16, threshold)
     query_blocks, reference_blocks = literal_blocks(6), literal_blocks(7)
@@ -61,7 +61,7 @@ def test_cohog_descriptor_good_regions_and_score(which, threshold):
 
 def test_hog_is_the_cosine_of_whole_image_histograms():
     technique = create("hog", {"w1": 64})
-    images = [textured(8), textured(9)]
+    images = [draw_texture(8), draw_texture(9)]
     vectors = []
     for image in images:
         cells = literal.cell_histograms(literal.grey_square(image, 64), 8, 9, False)

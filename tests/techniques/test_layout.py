@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured, view_from_above
+from pictures import draw_texture, render_view
 
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
@@ -16,7 +16,7 @@ NOTHING = 0x88
 
 def view(seed, rotation_deg=0.0, right_px=0, down_px=0):
     """The ground of a place."""
-    return view_from_above(textured(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, rotation_deg, right_px, down_px)
+    return render_view(draw_texture(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, rotation_deg, right_px, down_px)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from tiny_networks import CARD, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
@@ -40,7 +40,7 @@ def test_score_places_is_zero_for_an_image_without_regions(models):
         np.savez(models / f"dim_{kind}{count}.npz", words=words, model_sha256=sha256)
     for name, count in (("region_vlad", 12), ("cross_region_bow", 40)):
         it = create(name, {"model": "dim", "words": count})
-        night, day = it.encode(np.zeros((32, 32), np.uint8)), it.encode(textured(1))
+        night, day = it.encode(np.zeros((32, 32), np.uint8)), it.encode(draw_texture(1))
         assert (night.quality, day.quality) == (0, 1)
         scores, _ = it.score_places(night, np.stack([day.coarse, night.coarse]), None)
         assert scores.tolist() == [0, 0]

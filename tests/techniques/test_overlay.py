@@ -5,7 +5,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from pictures import view_from_above
+from pictures import render_view
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import overlay
@@ -26,7 +26,7 @@ def make_ground(seed):
 
 
 def view(ground, *moved):
-    return view_from_above(ground, SIDE_PX, *moved)
+    return render_view(ground, SIDE_PX, *moved)
 
 
 def patterns(seed):

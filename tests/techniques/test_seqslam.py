@@ -4,7 +4,7 @@ import math
 
 import cv2
 import numpy as np
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.techniques.seqslam import SeqSlam
 
@@ -33,12 +33,12 @@ def literal_enhanced(differences, window=10):
 
 
 def encode_rows(technique, count, first=0):
-    return np.stack([technique.encode(textured(first + seed)).coarse for seed in range(count)])
+    return np.stack([technique.encode(draw_texture(first + seed)).coarse for seed in range(count)])
 
 
 def test_encode_makes_the_image_of_the_paper():
     technique = SeqSlam()
-    picture = textured(3)
+    picture = draw_texture(3)
     small = cv2.resize(picture, (64, 32), interpolation=cv2.INTER_AREA)
     made = technique.encode(picture)
     assert made.coarse.dtype == np.uint8
@@ -64,7 +64,7 @@ def test_encode_ignores_light_and_contrast_and_marks_flat_patches():
 def test_scores_are_the_enhanced_mean_absolute_differences_of_the_paper():
     technique = SeqSlam()
     rows = encode_rows(technique, 40)
-    query = technique.encode(cv2.convertScaleAbs(textured(17), alpha=0.7))
+    query = technique.encode(cv2.convertScaleAbs(draw_texture(17), alpha=0.7))
     scores, hypotheses = technique.score_places(query, rows, None)
     differences = [sum(abs(int(a) - int(b)) for a, b in zip(row, query.coarse, strict=True)) / 2048 for row in rows]
     np.testing.assert_allclose(scores, 0.5 - literal_enhanced(differences) / (2 * 10 / math.sqrt(11)), atol=1e-6)

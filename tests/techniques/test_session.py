@@ -6,7 +6,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
@@ -18,7 +18,7 @@ def test_run_returns_both_outputs_with_their_shapes(models):
     write_network(models)
     features, descriptor = open_backbone("tiny", "features"), open_backbone("tiny", "descriptor")
     assert (features.shape, descriptor.shape) == (FEATURES, (16,))
-    image = textured(1)
+    image = draw_texture(1)
     found = features.run(image)
     assert found.dtype == np.float32
     pooled = found.reshape(4, 2, 5, 2, 7).mean(axis=(2, 4))
@@ -79,7 +79,7 @@ def test_run_refuses_an_image_with_invalid_output(models):
     for value, says in ((np.inf, "not finite"), (1e30, r"beyond 1e\+12"), (0, "zeros")):  # 1e30: of infinite length
         backbone.session = FakeSession(np.full((1, *FEATURES), value, np.float32))
         with pytest.raises(ModelError, match=says):
-            backbone.run(textured(1))
+            backbone.run(draw_texture(1))
 
 
 class FakeSession:
@@ -126,18 +126,18 @@ def test_techniques_without_networks_need_no_onnxruntime(models):
     assert done.stdout.count("\n") == 1
 
 
-def rule(**changes):
+def make_rule(**changes):
     values = {"layout": "NCHW", "height": 12, "width": 16, "colour": "grey", "equalise": False, "resize": "linear"}
     return InputRule(**{**values, "scale": 1 / 255, "mean": [0.0], **changes})
 
 
-def coloured(seed):
-    return np.dstack([textured(seed), textured(seed + 10), textured(seed + 20)])
+def draw_colour_picture(seed):
+    return np.dstack([draw_texture(seed), draw_texture(seed + 10), draw_texture(seed + 20)])
 
 
 def test_calc_prepares_images_as_in_its_paper():
-    image = coloured(1)
-    it = rule(height=120, width=160, equalise=True, resize="cubic")
+    image = draw_colour_picture(1)
+    it = make_rule(height=120, width=160, equalise=True, resize="cubic")
     yuv = cv2.cvtColor(image, cv2.COLOR_BGR2YUV)
     yuv[..., 0] = cv2.equalizeHist(yuv[..., 0].copy())
     grey = cv2.cvtColor(cv2.cvtColor(yuv, cv2.COLOR_YUV2BGR), cv2.COLOR_BGR2GRAY)
@@ -151,19 +151,19 @@ def test_calc_prepares_images_as_in_its_paper():
 def test_run_orders_colours_as_in_the_card():
     image = np.zeros((12, 16, 3), np.uint8)
     image[:] = (10, 20, 30)  # blue, green, red
-    assert prepare_input(image, rule(colour="bgr", scale=1.0))[0, :, 0, 0].tolist() == [10, 20, 30]
-    assert prepare_input(image, rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [30, 20, 10]
-    assert prepare_input(image[..., 0], rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [10, 10, 10]
+    assert prepare_input(image, make_rule(colour="bgr", scale=1.0))[0, :, 0, 0].tolist() == [10, 20, 30]
+    assert prepare_input(image, make_rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [30, 20, 10]
+    assert prepare_input(image[..., 0], make_rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [10, 10, 10]
 
 
 def test_scale_mean_and_deviation_in_this_order():
     image = np.full((12, 16, 3), 51, np.uint8)
-    it = rule(colour="rgb", mean=[0.1, 0.2, 0.3], std=[0.5, 1.0, 2.0])
+    it = make_rule(colour="rgb", mean=[0.1, 0.2, 0.3], std=[0.5, 1.0, 2.0])
     np.testing.assert_allclose(prepare_input(image, it)[0, :, 5, 5], [0.2, 0.0, -0.05], atol=1e-6)
 
 
 def test_run_replaces_masked_pixels_by_the_mean_of_the_others():
-    image = coloured(3)
+    image = draw_colour_picture(3)
     mask = np.ones(image.shape[:2], bool)
     mask[:, 100:] = False
     filled = fill_masked(image, mask)

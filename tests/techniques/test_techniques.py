@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.errors import UsageError
 from edgevpr.techniques import create, list_techniques
@@ -11,7 +11,7 @@ from edgevpr.techniques import create, list_techniques
 @pytest.mark.parametrize("name", list_techniques())
 def test_score_places_is_highest_for_the_same_image(name):
     technique = create(name)
-    descriptors = [technique.encode(textured(seed)) for seed in range(4)]
+    descriptors = [technique.encode(draw_texture(seed)) for seed in range(4)]
     coarse = np.stack([d.coarse for d in descriptors])
     mean = coarse.astype(np.float32).mean(axis=0)
     rows = technique.pack(coarse, mean) if technique.spec.packed else coarse
@@ -31,17 +31,17 @@ def test_match_scores_zero_for_a_blank_image():
     technique = create("cohog")
     grey_wall = technique.encode(np.full((120, 160), 128, np.uint8))
     assert grey_wall.quality == 0
-    assert technique.match(grey_wall, technique.encode(textured(1)).fine).score == 0
+    assert technique.match(grey_wall, technique.encode(draw_texture(1)).fine).score == 0
 
 
 @pytest.mark.parametrize(
     ("name", "parameters"), [*((name, {}) for name in list_techniques()), ("cohog", {"camera": "nadir"})]
 )
 def test_encode_leaves_out_masked_pixels(name, parameters):
-    technique, image = create(name, parameters), textured(5)
+    technique, image = create(name, parameters), draw_texture(5)
     mask = np.ones(image.shape, bool)
     mask[70:] = False
-    changed = np.where(np.arange(120)[:, None] < 90, image, textured(6))  # a pixel counts for those around it
+    changed = np.where(np.arange(120)[:, None] < 90, image, draw_texture(6))  # a pixel counts for those around it
     seen, painted = (technique.encode(each, mask) for each in (image, changed))
     assert seen.coarse.tobytes() == painted.coarse.tobytes() != technique.encode(image).coarse.tobytes()
     assert np.array_equal(seen.fine, painted.fine)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import rough_ground, view_from_above
+from pictures import draw_rough_ground, render_view
 
 from edgevpr.core.contract import find_nearest_height
 from edgevpr.techniques import create
@@ -14,7 +14,7 @@ SIDE_PX = 384
 
 
 def view(seed, height_ratio=1.0, rotation_deg=0.0, right_px=0.0):
-    return view_from_above(rough_ground(1100, seed), SIDE_PX, rotation_deg, right_px, height=height_ratio)
+    return render_view(draw_rough_ground(1100, seed), SIDE_PX, rotation_deg, right_px, height=height_ratio)
 
 
 @pytest.fixture(scope="module")

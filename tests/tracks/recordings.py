@@ -53,22 +53,22 @@ def write_tlog(path, points, shots=()):
 
     link = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
 
-    def stamped(t_s, message):
+    def add_stamp(t_s, message):
         return struct.pack(">Q", int(1e6 * (START_S + t_s))) + message.pack(link)
 
     blocks = []
     for t_s, lat, lon, alt, height, roll, pitch, yaw in points:
         at_ms, turned = int(1000 * t_s), map(radians, (roll, pitch, yaw))
         where = round(lat * 1e7), round(lon * 1e7), round(alt * 1000), round(height * 1000)
-        blocks.append(stamped(t_s, dialect.MAVLink_attitude_message(at_ms, *turned, 0, 0, 0)))
+        blocks.append(add_stamp(t_s, dialect.MAVLink_attitude_message(at_ms, *turned, 0, 0, 0)))
         position = dialect.MAVLink_global_position_int_message(at_ms, *where, 0, 0, 0, round(100 * yaw))
-        blocks.append(stamped(t_s, position))
+        blocks.append(add_stamp(t_s, position))
     for t_s, lat, lon, alt, height, roll, pitch, yaw in shots:
         where = round(lat * 1e7), round(lon * 1e7), alt, height
         taken = dialect.MAVLink_camera_feedback_message(
             int(1e6 * (START_S + t_s)), 1, 0, 0, *where, roll, pitch, yaw, 0, 0
         )
-        blocks.append(stamped(t_s, taken))
+        blocks.append(add_stamp(t_s, taken))
     path.write_bytes(b"".join(blocks))
 
 

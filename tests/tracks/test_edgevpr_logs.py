@@ -3,8 +3,8 @@
 import cv2
 import pytest
 from commands import run_json
-from fakes import vehicle_at
-from pictures import textured
+from fakes import make_vehicle
+from pictures import draw_texture
 
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import read_positions
@@ -19,18 +19,18 @@ def vehicles():
     """Reports at the time of each picture: one that counts, no report, an old one, no GPS, and a fix of ours just now
     and long ago."""
     return (
-        vehicle_at(50.1, 8.0, FRAME_S, roll_deg=3.0, height_m=80.0),
+        make_vehicle(50.1, 8.0, FRAME_S, roll_deg=3.0, height_m=80.0),
         None,
-        vehicle_at(50.2, 8.0, FRAME_S - 1.5),
-        vehicle_at(50.3, 8.0, FRAME_S, has_gps=False),
-        vehicle_at(50.4, 8.0, FRAME_S, t_fix_s=FRAME_S - 9.0),
-        vehicle_at(50.5, 8.0, FRAME_S, t_fix_s=FRAME_S - 11.0),
+        make_vehicle(50.2, 8.0, FRAME_S - 1.5),
+        make_vehicle(50.3, 8.0, FRAME_S, has_gps=False),
+        make_vehicle(50.4, 8.0, FRAME_S, t_fix_s=FRAME_S - 9.0),
+        make_vehicle(50.5, 8.0, FRAME_S, t_fix_s=FRAME_S - 11.0),
     )
 
 
 def fly(tmp_path, is_live=True):
     """Write the log of a recorded flight, and return it and the folder of its pictures."""
-    jpeg = cv2.imencode(".jpg", textured(1, 48, 64))[1].tobytes()
+    jpeg = cv2.imencode(".jpg", draw_texture(1, 48, 64))[1].tobytes()
     with Recording(tmp_path / "recorded", 1000) as recording, FlightLog(tmp_path / "flight.jsonl") as log:
         log.write("start", recording=str(recording.path))
         recording.note("is_live", is_live)

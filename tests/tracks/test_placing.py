@@ -5,8 +5,8 @@ from datetime import datetime, timedelta, timezone
 import cv2
 import numpy as np
 import pytest
-from commands import refused, run, run_json
-from pictures import textured
+from commands import expect_refusal, run, run_json
+from pictures import draw_texture
 from PIL import Image
 from recordings import START_S, write_dataflash, write_gpx
 
@@ -25,7 +25,7 @@ def write_photograph(path, t_s, picture=None, clock_off_s=0.0):
     exif = Image.Exif()
     shown = datetime.fromtimestamp(START_S + t_s - clock_off_s, timezone.utc)
     exif.get_ifd(0x8769)[0x9003] = shown.strftime("%Y:%m:%d %H:%M:%S")
-    Image.fromarray(textured(1, 48, 64) if picture is None else picture).save(path, "JPEG", exif=exif, quality=92)
+    Image.fromarray(draw_texture(1, 48, 64) if picture is None else picture).save(path, "JPEG", exif=exif, quality=92)
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_positions_assigns_images_by_name(capsys, folder, tmp_path):
     tags = read_positions(folder / "positions.csv")
     assert tags["IMG_3.JPG"].position.lat_deg == pytest.approx(50.4)
     assert tags["IMG_3.JPG"].t_utc_s == START_S + 7, "what the table does not say is taken from the picture"
-    assert "already exists" in refused(capsys, "positions", tmp_path / "table.csv", "--images", folder)
+    assert "already exists" in expect_refusal(capsys, "positions", tmp_path / "table.csv", "--images", folder)
 
 
 def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
@@ -81,14 +81,14 @@ def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours):
 
 def test_positions_refuses_an_ambiguous_time_zone(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t, HOME[0], HOME[1] + 1e-6 * t) for t in range(4000, 20_000, 4)])
-    assert "--offset-s" in refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
+    assert "--offset-s" in expect_refusal(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     flags = ("--images", folder, "--offset-s", 7200)
     assert run_json(capsys, "positions", tmp_path / "t.gpx", *flags)["placed"] == 6
 
 
 def test_positions_refuses_pictures_of_another_day_with_both_times(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t + 300_000, *HOME) for t in range(9)])
-    said = refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
+    said = expect_refusal(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     day = (datetime.fromtimestamp(START_S, timezone.utc) + timedelta(seconds=300_000)).date().isoformat()
     assert day in said
     assert not (folder / "positions.csv").exists()
@@ -97,8 +97,9 @@ def test_positions_refuses_pictures_of_another_day_with_both_times(capsys, folde
 def fly_curves(count=40):
     """Return a track at 5 Hz, (seconds, lat, lon), of an aircraft that flies curves, and pictures of the ground that it
     takes every two seconds, its camera turned by 30 degrees against its nose."""
-    ground = textured(5, GROUND_PX, GROUND_PX)
-    ground[: GROUND_PX // 3, : GROUND_PX // 3] = textured(6, GROUND_PX, GROUND_PX)[-GROUND_PX // 3 :, -GROUND_PX // 3 :]
+    ground = draw_texture(5, GROUND_PX, GROUND_PX)
+    third = GROUND_PX // 3
+    ground[:third, :third] = draw_texture(6, GROUND_PX, GROUND_PX)[-third:, -third:]
     noise = np.random.default_rng(2).normal(0, 25, (GROUND_PX // 6, GROUND_PX // 6))
     ground = np.clip(ground + cv2.resize(noise, ground.shape[::-1], interpolation=cv2.INTER_CUBIC), 0, 255)
     t_s = np.arange(0, 2 * count + 0.1, 0.2)

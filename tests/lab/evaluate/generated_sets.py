@@ -1,7 +1,7 @@
 """Small sets of generated pictures for the tests of evaluations."""
 
 import cv2
-from pictures import textured
+from pictures import draw_texture
 
 
 def make_set(folder, places=6):
@@ -11,11 +11,11 @@ def make_set(folder, places=6):
     for part in ("query", "ref"):
         (folder / part).mkdir(parents=True)
     for place in range(places):
-        picture = textured(place)
+        picture = draw_texture(place)
         cv2.imwrite(str(folder / "query" / f"q{place}.png"), picture // 2)
         right, loose, status = f"r{place}.png", "", "ok"
         if place == places - 1:
-            picture, right, status = textured(1000), "", "novel"
+            picture, right, status = draw_texture(1000), "", "novel"
         elif place == 1:  # its own place counts neither way
             right, loose = "r0.png", "r1.png"
         elif place == 2:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 import cv2
 import pytest
 from generated_sets import make_set
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import iterate_silently
@@ -58,7 +58,7 @@ def test_evaluate_measures_recall_costs_and_sizes(folder, name, parameters):
 
 def test_evaluate_counts_a_match_accepted_off_the_map(folder):
     cv2.imwrite(
-        str(folder / "ref" / "r7.png"), textured(7)
+        str(folder / "ref" / "r7.png"), draw_texture(7)
     )  # its twin is in the map, and the truth has no place for it
     result = evaluate(folder, "cohog", COHOG)
     assert (result.accepted_off_map, result.accepted_wrong, result.accepted_elsewhere) == (1, 2, 2)
@@ -68,7 +68,7 @@ def test_evaluate_ignores_a_loose_reference_and_counts_the_next(folder):
     # The only query looks exactly like r0, which is neither right nor wrong; r1 would be wrong, all others right.
     others = " ".join(f"r{place}.png" for place in range(2, 8))
     (folder / "truth.csv").write_text(f"query_file,ref_files,ref_files_loose\nq0.png,{others},r0.png {others}\n")
-    cv2.imwrite(str(folder / "ref" / "r2.png"), cv2.blur(textured(0), (3, 3)))
+    cv2.imwrite(str(folder / "ref" / "r2.png"), cv2.blur(draw_texture(0), (3, 3)))
     result = evaluate(folder, "hog", HOG)
     assert (result.recall_at_1, result.with_match, result.unscored) == (1, None, 7)
     assert (result.accepted, result.accepted_wrong) == (1, 0)

@@ -22,7 +22,7 @@ PUBLISHED = DATA / "vprbench_precomputed"
 NEVER = math.inf
 
 
-def compute_figures_of(*queries):
+def measure_queries(*queries):
     """The figures of queries (score, rank of the first right reference), whose place is in the map unless they have a
     third value, False."""
     scores, ranks, has_match = zip(*((*query, True)[:3] for query in queries), strict=True)
@@ -30,7 +30,7 @@ def compute_figures_of(*queries):
 
 
 def test_compute_quality_of_a_perfect_run_with_ties():
-    found = compute_figures_of((0.9, 0), (0.9, 0), (0.5, 0), (0.5, 0))
+    found = measure_queries((0.9, 0), (0.9, 0), (0.5, 0), (0.5, 0))
     assert (found.auc_from_zero, found.auc_2_3) == (1, 0.5), "2.3 takes half of it for the ties"
     assert (found.ep, found.precision_at_100_recall, found.roc_auc) == (1, 1, None)
     assert found.recall_at_100_precision_vpr_bench == found.recall_at_100_precision_vpr_tutorial == 1
@@ -39,7 +39,7 @@ def test_compute_quality_of_a_perfect_run_with_ties():
 
 def test_compute_quality_counts_queries_off_the_map():
     # By falling score: right, off the map, right, wrong (third), right.
-    found = compute_figures_of((0.9, 0), (0.8, NEVER, False), (0.7, 0), (0.6, 2), (0.5, 0))
+    found = measure_queries((0.9, 0), (0.8, NEVER, False), (0.7, 0), (0.6, 2), (0.5, 0))
     assert (found.queries, found.queries_off_map) == (5, 1)
     assert (found.recall_at_1, found.recall_at_5) == (3 / 5, 4 / 5)
     # Points (recall, precision): (1/3, 1), (1/3, 1/2), (2/3, 2/3), (2/3, 1/2), (1, 3/5).
@@ -59,7 +59,7 @@ def test_compute_quality_counts_queries_off_the_map():
 
 @pytest.mark.parametrize("score", [0.3, -math.inf])
 def test_compute_quality_without_any_match(score):
-    found = compute_figures_of((score, NEVER, False), (score, NEVER, False))
+    found = measure_queries((score, NEVER, False), (score, NEVER, False))
     assert (found.queries_off_map, found.with_match) == (2, None)
     shares = (found.recall_at_10, found.auc_from_zero, found.auc_2_3, found.ep, found.precision_at_100_recall)
     assert shares == (0, 0, 0, 0, 0)

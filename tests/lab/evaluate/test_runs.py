@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from commands import refused, run, run_json
+from commands import expect_refusal, run, run_json
 from generated_sets import make_set
 
 HOG = ["--techniques", "hog", "--param", "hog.w1=64"]
@@ -37,7 +37,7 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
     content = json.loads(said.out)
     assert [row["set"] for row in content["results"]] == ["meadow"]
     assert [(row["set"], row["row"]) for row in content["failed"]] == [("broken", "hog")]
-    assert "r1.png" in refused(capsys, "eval", "--data", broken, *HOG, code=1), "nothing was measured"
+    assert "r1.png" in expect_refusal(capsys, "eval", "--data", broken, *HOG, code=1), "nothing was measured"
 
 
 @pytest.mark.parametrize(
@@ -54,4 +54,4 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
 def test_eval_refuses_a_wrong_request_in_one_sentence(tmp_path, monkeypatch, capsys, argv, said):
     monkeypatch.chdir(tmp_path)
     meadow = make_set(tmp_path / "meadow")
-    assert said in refused(capsys, "eval", *[meadow if word == "SET" else word for word in argv])
+    assert said in expect_refusal(capsys, "eval", *[meadow if word == "SET" else word for word in argv])

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-from rasters import HOME, MARKS_M, marked_raster, write_mission
+from rasters import HOME, MARKS_M, write_marked_raster, write_mission
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, move_position, offset_position
@@ -27,7 +27,7 @@ LEVEL = CameraPose(east_m=0, north_m=0, height_m=80, heading_deg=0)
 @pytest.fixture(scope="module")
 def orthophoto(tmp_path_factory):
     """Marked ground of 300 m, in Web Mercator and turned: the flight must not show it."""
-    path = marked_raster(
+    path = write_marked_raster(
         tmp_path_factory.mktemp("ground") / "o.tif", "EPSG:3857", pixel_m=0.4, side_px=750, rotation_deg=30
     )
     return Orthophoto(path)

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import av
 import cv2
 import numpy as np
-from fakes import vehicle_at
+from fakes import make_vehicle
 
 from edgevpr.core.types import Frame
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
@@ -50,7 +50,7 @@ class CameraFlight:
         reported = {"heading_deg": heading_deg + off_deg[0], "height_m": height_m}
         reported |= {"roll_deg": roll_deg + off_deg[1], "pitch_deg": pitch_deg + off_deg[2]}
         reported["velocity_m_s"] = tuple(np.add(velocity_m_s, self.rng.normal(0, 0.4, 2)))
-        vehicle = vehicle_at(47.0, 8.0, self.t_s, **reported)
+        vehicle = make_vehicle(47.0, 8.0, self.t_s, **reported)
         self.refused.append(self.watch.judge(Frame(image=picture, name="", t_mono_s=self.t_s), vehicle))
         return self.refused[-1]
 
@@ -69,7 +69,7 @@ def compress(picture, rng):
     return cv2.imdecode(cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))[1], cv2.IMREAD_COLOR)
 
 
-def at_constant_bitrate(picture, count, kbit_s=200):
+def encode_at_constant_bitrate(picture, count, kbit_s=200):
     """A picture sent `count` times by an encoder at constant bitrate, as it is decoded."""
     sent = io.BytesIO()
     with av.open(sent, "w", format="mpegts") as box:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from air import HOME, PICTURE, STEP_S, SimFlight, make_match
-from fakes import to_autopilot
+from fakes import make_output
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -131,7 +131,7 @@ def test_check_age_reports_once_and_skips_the_match(tmp_path, clock, link):
     log = FlightLog(tmp_path / "log", clock=clock)
     ages = [(False, 0.0), (True, 0.0), (True, 0.0), (False, 0.6)]
     navigator, events, summaries = Navigator(1.0, 1.0), [], []
-    autopilot = to_autopilot(link, navigator, clock, log)
+    autopilot = make_output(link, navigator, clock, log)
     for is_unknown, delay_s in ages:
         navigator.age = SimpleNamespace(judge=lambda _: None, is_unknown=is_unknown, delay_s=delay_s)
         event = make_match(Position(*HOME), clock(), None, 3.0, (1,))

@@ -4,7 +4,7 @@ things."""
 import numpy as np
 import pytest
 from fakes import FakeSource
-from flights import flight_over, pictures, select
+from flights import pictures, prepare_flight, select
 
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW
@@ -52,7 +52,7 @@ def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, st
 
 
 def test_fix_without_a_link_is_reported(recording, tmp_path, clock):
-    lines = flight_over(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
+    lines = prepare_flight(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
     assert fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
     assert not select(lines, "answer")
 

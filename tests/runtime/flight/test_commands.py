@@ -38,8 +38,8 @@ def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_
 def test_pause_halts_a_recording(make_flight, clock, link):
     flown = make_flight()
     source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.send_command(UserCommand.PAUSE))
-    clock.at(30.0, lambda: link.send_command(UserCommand.RESUME))
-    clock.at(60.0, flown.stop)
+    clock.schedule(30.0, lambda: link.send_command(UserCommand.RESUME))
+    clock.schedule(60.0, flown.stop)
     started_s = clock.now_s
     lines = flown.fly(source)
     assert queries(lines) == ["frame 000000", "frame 000001"], "paused, gone on, and paused again by the second"

@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 from fakes import FakeSource, format_note
-from flights import flight_meter, select
-from pictures import textured
+from flights import make_flight_meter, select
+from pictures import draw_texture
 
 from edgevpr.cli.top import format_status
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -24,14 +24,14 @@ UNKNOWN = ThermalState(temperature_c=None, frequency_mhz=None, throttled=None, w
 def watch_states(notifier, link):
     """Let states be read each second; return (second, severity, text) of all that is sent to the ground station."""
 
-    def watched(states):
+    def watch(states):
         companion, found = CompanionWatch(notifier), []
         for second, state in enumerate(states):
             companion.take(float(second), state)
             found += [(second, *text) for text in link.texts()[len(found) :]]
         return found
 
-    return watched
+    return watch
 
 
 def test_companion_watch_reports_a_problem_at_its_start_and_end(watch_states):
@@ -63,8 +63,8 @@ def test_companion_watch_reports_under_voltage_everywhere(make_flight, clock, li
             statuses.append(status)
             tree({firmware: {1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n")})
 
-    meter = flight_meter(flight, machine=Machine(flight.board, ThermalWatch(root)))
-    lines = flight.fly(FakeSource([textured(1, 240, 320)] * 45, clock), meter, status=Status())
+    meter = make_flight_meter(flight, machine=Machine(flight.board, ThermalWatch(root)))
+    lines = flight.fly(FakeSource([draw_texture(1, 240, 320)] * 45, clock), meter, status=Status())
     notes = [(line["note"]["code"], line["why"]) for line in select(lines, "companion")]
     begun = str(Reason(ReasonCode.UNDER_VOLTAGE))
     signs = "under-voltage, throttled now"

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from fakes import FakeClock, FakeLink, FakeSource, make_vehicle
 from flights import STEP_DEG, Flight, select
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
@@ -24,11 +24,11 @@ def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
     def vehicle():
         north = 50 + STEP_DEG * (clock.now_s - 1000.0)
         said = {"has_gps": has_gps, "position_sd_m": 20.0, "velocity_m_s": (0.0, STEP_DEG * 111_195)}
-        return vehicle_at(north, 8.0 + off_deg, clock.now_s, **said)
+        return make_vehicle(north, 8.0 + off_deg, clock.now_s, **said)
 
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
-    lines = flight.fly(FakeSource([textured(number, 240, 320) for number in pictures], clock))
+    lines = flight.fly(FakeSource([draw_texture(number, 240, 320) for number in pictures], clock))
     return select(lines, "query"), link
 
 

@@ -12,7 +12,7 @@ import pytest
 from fakes import FakeSource, format_note
 from flights import PLACES, STEP_DEG, Flight, fly_acts, noop, select
 from map_writer import write_sql
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.messages import Health
@@ -78,15 +78,14 @@ def test_failures_are_critical_and_reported_once_after_ten_until_recovery(place_
 
     damage = partial(write_sql, place_map, "UPDATE places SET fine = x'00'")
 
-    def look():
+    def record_health():
         health.append(link.health)
 
     flight = Flight(place_map, tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
-    calls = iter(
-        [noop, damage, *[look] * MAX_FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look]
-    )
+    looks = [record_health] * MAX_FAILURES_IN_A_ROW
+    calls = iter([noop, damage, *looks, partial(place_map.write_bytes, whole), *looks[:3]])
     count = MAX_FAILURES_IN_A_ROW + 6
-    lines = flight.fly(FakeSource([textured(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
+    lines = flight.fly(FakeSource([draw_texture(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
     queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * (MAX_FAILURES_IN_A_ROW + 1), *[True] * 4]
     assert health[-4] is Health.CRITICAL

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from fakes import FakeSource, vehicle_at
+from fakes import FakeSource, make_vehicle
 from flights import select
-from frozen_cameras import DOWN, CameraFlight, at_constant_bitrate, compress, draw_clock, make_ground
-from pictures import textured
+from frozen_cameras import DOWN, CameraFlight, compress, draw_clock, encode_at_constant_bitrate, make_ground
+from pictures import draw_texture
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Health
@@ -28,7 +28,7 @@ def ground():
 
 
 def encode_frozen(picture, rng, count):
-    return at_constant_bitrate(picture, 10 * count)[::10]
+    return encode_at_constant_bitrate(picture, 10 * count)[::10]
 
 
 def compress_frozen(picture, rng, count):
@@ -190,7 +190,7 @@ def test_flight_refuses_frozen_images_and_reports_them(make_flight, clock, link)
 
     def vehicle():
         heading_deg = 10.0 * (clock.now_s - 1000.0) % 360
-        return vehicle_at(50.0, 8.0, clock.now_s, heading_deg=heading_deg, roll_deg=0.0, pitch_deg=0.0)
+        return make_vehicle(50.0, 8.0, clock.now_s, heading_deg=heading_deg, roll_deg=0.0, pitch_deg=0.0)
 
     def read():
         health.append(link.health)
@@ -199,7 +199,7 @@ def test_flight_refuses_frozen_images_and_reports_them(make_flight, clock, link)
     link.vehicle, flight = vehicle, make_flight()
     noise = np.random.default_rng(2)
     shown = [0, 1, *[2] * 12, 3, 4, 5, 6]
-    pictures = [textured(number, 240, 320) + noise.integers(0, 4, (240, 320), np.uint8) for number in shown]
+    pictures = [draw_texture(number, 240, 320) + noise.integers(0, 4, (240, 320), np.uint8) for number in shown]
     lines = flight.fly(FakeSource(pictures, clock, work=read), status=SimpleNamespace(write=seen.append))
     accepted = [line["accepted"] for line in select(lines, "query")]
     refused = select(lines, "unusable")

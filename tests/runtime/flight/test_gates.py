@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from air import HOME, make_match
-from fakes import receiver_at, vehicle_at
+from fakes import make_receiver, make_vehicle
 
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -75,7 +75,7 @@ def navigate(channel=Channel.COMMAND, *, reports=None, is_heard=True, map_sd_m=1
     navigator._navigation = KnownNavigation(**known)
     if is_heard:
         said = {"has_gps": False, "velocity_m_s": (0.0, 0.0)} | (reports or {})
-        navigator.handle_vehicle(vehicle_at(*HOME, said.pop("t_received_s", NOW_S), **said))
+        navigator.handle_vehicle(make_vehicle(*HOME, said.pop("t_received_s", NOW_S), **said))
     return navigator
 
 
@@ -114,7 +114,7 @@ def test_accuracy_is_never_better_than_the_common_error_of_all_fixes(accuracy_m,
 
 
 def receiver(sd_m=1.0, **said):
-    return {"has_gps": True, "gps": receiver_at(HOME, sd_m, NOW_S, **said)}
+    return {"has_gps": True, "gps": make_receiver(HOME, sd_m, NOW_S, **said)}
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
     assert navigator._navigation.reports == [(True, False)]
     navigator.estimate_state(NOW_S)
     navigator.trust_gps(False)
-    navigator.handle_vehicle(vehicle_at(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
+    navigator.handle_vehicle(make_vehicle(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
     assert navigator._navigation.reports[1:] == [(False, is_ours)]
 
 
@@ -217,7 +217,7 @@ def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
 def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
     navigator, motions = navigate(channel), []
     navigator.age = SimpleNamespace(add_motion=lambda *motion: motions.append(motion))
-    vehicle = vehicle_at(*HOME, NOW_S, velocity_m_s=(0.0, 0.0))
+    vehicle = make_vehicle(*HOME, NOW_S, velocity_m_s=(0.0, 0.0))
     navigator.handle_vehicle(vehicle)
     navigator._navigation.has_gps, navigator._navigation.path_velocity_m_s = has_gps, (1.0, 2.0)
     navigator.handle_vehicle(vehicle)
@@ -228,7 +228,7 @@ def test_frame_claims_a_height_error_shown_by_images():
     navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
     navigator.handle_frame(fake_match())
     navigator.correct_height(1.2, 0.1)
-    navigator.handle_frame(fake_match(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
+    navigator.handle_frame(fake_match(vehicle=make_vehicle(*HOME, NOW_S)), is_query=False)
     navigator.correct_height(1.0, 0.3)
     navigator.handle_frame(fake_match())
     navigator.handle_frame(fake_match(frame=None))

@@ -2,8 +2,8 @@
 
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, flight_meter, select
-from pictures import textured
+from flights import Flight, make_flight_meter, select
+from pictures import draw_texture
 
 from edgevpr.runtime.flight.metering import FlightMeter, LoadReading
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -31,8 +31,8 @@ def govern(place_map, log, readings, count, fewer_candidates=(), **settings):
     """(changes, all lines, announcements, the flight) of a flight of `count` turns of 4 s."""
     clock = FakeClock()
     flight = Flight(place_map, log, clock, FakeLink(clock), **settings)
-    source = FakeSource([textured(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
-    lines = flight.fly(source, flight_meter(flight, ScriptedMeter, readings=readings), fewer_candidates)
+    source = FakeSource([draw_texture(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
+    lines = flight.fly(source, make_flight_meter(flight, ScriptedMeter, readings=readings), fewer_candidates)
     return select(lines, "governor"), lines, flight.link.texts(), flight
 
 

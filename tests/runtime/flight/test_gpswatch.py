@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 from air import HOME, make_match
-from fakes import FakeClock, FakeLink, format_note, receiver_at, to_autopilot, vehicle_at
+from fakes import FakeClock, FakeLink, format_note, make_output, make_receiver, make_vehicle
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -28,13 +28,13 @@ class GpsHover:
 
     def __init__(self, sd_m=EXACT, map_sd_m=0.0):
         self.link, self.navigator, self.sd_m = FakeLink(FakeClock()), Navigator(map_sd_m, 1.0), sd_m
-        autopilot = to_autopilot(self.link, self.navigator, FakeClock())
+        autopilot = make_output(self.link, self.navigator, FakeClock())
         self.watch = GpsWatch(map_sd_m, Notifier(FlightLog(None), self.link), autopilot)
 
     def match(self, off_m, after_s, places, *, lean=None, view=None, vehicle=None, **said):
         """Watch a match that is so far east of GPS, and return whether GPS is wrong."""
         t_s = BEGIN_S + after_s
-        vehicle = vehicle or vehicle_at(*HOME, t_s, gps=receiver_at(HOME, self.sd_m[1], t_s), **said)
+        vehicle = vehicle or make_vehicle(*HOME, t_s, gps=make_receiver(HOME, self.sd_m[1], t_s), **said)
         self.watch.update(
             make_match(Position(*offset_position(*HOME, off_m, 0.0)), t_s, vehicle, self.sd_m[0], places, view, lean)
         )
@@ -154,18 +154,18 @@ def test_match_may_differ_from_gps_by_its_attitude_error(lean, height_m, is_wron
 def test_match_is_compared_with_the_receiver_position_at_its_time():
     velocity_m_s = 25.0, 0.0
     watched, where = GpsHover(), offset_position(*HOME, -25.0 * (0.8 + RECEIVER_LAG_S), 0.0)
-    receiver = receiver_at(where, 1.0, BEGIN_S - 0.8, velocity_m_s=(0.0, 9.0))
+    receiver = make_receiver(where, 1.0, BEGIN_S - 0.8, velocity_m_s=(0.0, 9.0))
     for velocity, off_m in ((velocity_m_s, 0.0), (None, 22.5)):
-        watched.match(0.0, 0.0, (1,), vehicle=vehicle_at(*HOME, BEGIN_S, gps=receiver, velocity_m_s=velocity))
+        watched.match(0.0, 0.0, (1,), vehicle=make_vehicle(*HOME, BEGIN_S, gps=receiver, velocity_m_s=velocity))
         assert watched.distances_m()[-1] == pytest.approx(off_m, abs=0.01)
 
 
 def test_gps_watch_skips_what_cannot_be_compared():
     watched = GpsHover()
-    for vehicle in (vehicle_at(*HOME, BEGIN_S, has_gps=False), vehicle_at(*HOME, BEGIN_S - 1.1)):
+    for vehicle in (make_vehicle(*HOME, BEGIN_S, has_gps=False), make_vehicle(*HOME, BEGIN_S - 1.1)):
         watched.match(0.0, 0.0, (1,), vehicle=vehicle)
     watched.match(0.0, 0.0, (1,), view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
-    here = make_match(Position(*HOME), BEGIN_S, vehicle_at(*HOME, BEGIN_S), 1.0, (1,))
+    here = make_match(Position(*HOME), BEGIN_S, make_vehicle(*HOME, BEGIN_S), 1.0, (1,))
     watched.watch.update(replace(here, vehicle=None))
     watched.watch.update(replace(here, located=None))
     assert watched.distances_m() == []

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
-from fakes import format_note, vehicle_at
+from fakes import format_note, make_vehicle
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.level import View
@@ -20,7 +20,7 @@ class Watch:
         for height_m in heights_m:
             self.clock.now_s += every_s
             now_s = self.clock.now_s
-            vehicle = vehicle_at(50.0, 8.0, now_s - age_s, has_gps=False, height_m=reported_m)
+            vehicle = make_vehicle(50.0, 8.0, now_s - age_s, has_gps=False, height_m=reported_m)
             self.watch.update(
                 SimpleNamespace(
                     frame=SimpleNamespace(t_mono_s=now_s),

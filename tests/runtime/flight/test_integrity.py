@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from air import GPS_SD_M, HOME, SimFlight, make_match, norms
-from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
+from fakes import FakeClock, FakeLink, make_output, make_receiver, make_vehicle
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import ReasonCode, read_reason
@@ -30,7 +30,7 @@ class GpsFlight(SimFlight):
         super().__init__(Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
         self.clock = clock
         self.link = FakeLink(self.clock)
-        self.autopilot = to_autopilot(self.link, self.navigator, self.clock, flight_log)
+        self.autopilot = make_output(self.link, self.navigator, self.clock, flight_log)
         self.log, self.drift_m_s, self.reports = flight_log.path, 0.0, []
         self.watch = GpsWatch(MAP_SD_M, Notifier(flight_log, self.link), self.autopilot)
 
@@ -158,9 +158,9 @@ def test_gps_watch_gives_no_false_alarm_in_thirty_minutes_of_noise(fix_sd_m):
                 turn = rng.uniform(0, 2 * math.pi)
                 off_m = 100 * np.array([math.cos(turn), math.sin(turn)])
             gps = offset_position(*HOME, *(at_m + wander_m))
-            known = {"gps": receiver_at(gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
+            known = {"gps": make_receiver(gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
             seen = Position(*offset_position(*HOME, *(at_m + off_m)))
-            watch.update(make_match(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),)))
+            watch.update(make_match(seen, t_s, make_vehicle(*gps, t_s, **known), fix_sd_m, (int(t_s),)))
             assert not watch.is_wrong
 
 

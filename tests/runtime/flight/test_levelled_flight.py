@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
+from fakes import FakeClock, FakeLink, FakeSource, make_receiver, make_vehicle
 from flights import STEP_DEG, Flight, select
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map
 
 from edgevpr.core.types import Frame, Position
@@ -23,7 +23,7 @@ def place_map(tmp_path_factory):
     technique = create("cohog", {"camera": "nadir"})
     frames = (
         Frame(
-            image=textured(place + 20, 256, 256),
+            image=draw_texture(place + 20, 256, 256),
             name=f"{place}",
             t_mono_s=0.0,
             position=Position(50 + place * STEP_DEG, 8.0),
@@ -40,11 +40,11 @@ def fly(place_map, log, turns, **said):
     clock, asked_s = FakeClock(), []
 
     def vehicle():
-        return vehicle_at(50.0, 8.0, clock.now_s, heading_deg=90.0 if turns else 0.0, **said)
+        return make_vehicle(50.0, 8.0, clock.now_s, heading_deg=90.0 if turns else 0.0, **said)
 
     link = FakeLink(clock, vehicle=vehicle)
     link.predict_vehicle = lambda t_mono_s: (asked_s.append(t_mono_s), vehicle())[1]
-    images = [np.ascontiguousarray(np.rot90(textured(place + 20, 256, 256), turns)) for place in range(3)]
+    images = [np.ascontiguousarray(np.rot90(draw_texture(place + 20, 256, 256), turns)) for place in range(3)]
     source = FakeSource(images, clock, work=lambda: clock.sleep(1.0))
     lines = Flight(place_map, log, clock, link, **{"source.fov_deg": 66.0, "match.reach_m_s": 20.0}).fly(source)
     return select(lines, "query"), asked_s
@@ -68,10 +68,10 @@ def test_flight_takes_odometry_frames_between_rare_queries_without_gps(place_map
 
     def vehicle():
         level = {"heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0, "height_m": 80.0}
-        gps = receiver_at((50.0, 8.0), 1.0, clock.now_s) if has_gps else None
-        return vehicle_at(50.0, 8.0, clock.now_s, velocity_m_s=(0.0, 0.0), has_gps=has_gps, gps=gps, **level)
+        gps = make_receiver((50.0, 8.0), 1.0, clock.now_s) if has_gps else None
+        return make_vehicle(50.0, 8.0, clock.now_s, velocity_m_s=(0.0, 0.0), has_gps=has_gps, gps=gps, **level)
 
-    source = FakeSource([textured(20, 256, 256)] * 21, clock, is_live=is_live)
+    source = FakeSource([draw_texture(20, 256, 256)] * 21, clock, is_live=is_live)
     flown = Flight(place_map, tmp_path / "f.jsonl", clock, FakeLink(clock, vehicle=vehicle), **FAR_APART)
     lines = flown.fly(source)
     queries = select(lines, "query")

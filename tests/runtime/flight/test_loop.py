@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 from fakes import FakeSource
 from flights import select
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import ImageError
@@ -14,7 +14,7 @@ from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.flight.stop import Stop, StopNow
 
-PICTURE = textured(1, 240, 320)
+PICTURE = draw_texture(1, 240, 320)
 
 
 @pytest.fixture
@@ -40,11 +40,11 @@ def test_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
 def test_stop_interrupts_the_recognition_of_a_frame(flight, clock):
     flown = flight()
 
-    def long(image, mask):
+    def encode_until_stop(image, mask):
         flown.stop()  # a signal comes
         raise AssertionError("the signal breaks this off")
 
-    flown.recogniser.technique.encode = long
+    flown.recogniser.technique.encode = encode_until_stop
     lines = flown.fly(FakeSource([PICTURE] * 9, clock))
     assert lines == [], "what was broken off is no query"
     flown.stop()  # and a second signal finds nothing to break off

@@ -7,15 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 from fakes import FakeSource
-from flights import flight_meter, select
-from pictures import textured
+from flights import make_flight_meter, select
+from pictures import draw_texture
 
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.machine import Machine
 
 pytestmark = pytest.mark.slow
 
-PICTURE = textured(1, 240, 320)
+PICTURE = draw_texture(1, 240, 320)
 
 
 def test_used_mah_of_a_flight_equals_the_closed_form(make_flight, clock):
@@ -56,7 +56,7 @@ def test_heat_is_logged_and_announced_and_figures_of_a_throttled_board_are_marke
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     flight = make_flight("hog")
     watch = SimpleNamespace(read=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
-    meter = flight_meter(flight, machine=Machine(flight.board, watch))
+    meter = make_flight_meter(flight, machine=Machine(flight.board, watch))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in select(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))

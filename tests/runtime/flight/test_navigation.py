@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from air import HOME, STEP_S, SimFlight, norms
-from fakes import receiver_at, vehicle_at
+from fakes import make_receiver, make_vehicle
 
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
@@ -116,10 +116,10 @@ class ReceiverOnly:
             steady_for_s = self.t_s - self.steady_since_s
             where = offset_position(*HOME, off_m - RECEIVER_LAG_S * velocity_m_s[0], 0.0)
             known = {"velocity_m_s": velocity_m_s, "steady_for_s": steady_for_s}
-            gps = receiver_at(where, 1.0, self.t_s, **known) if has_gps else None
+            gps = make_receiver(where, 1.0, self.t_s, **known) if has_gps else None
             estimate = offset_position(*HOME, estimate_m, 0.0)
             known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
-            self.navigation.add_report(vehicle_at(*estimate, self.t_s, **known), may_echo_ours=True)
+            self.navigation.add_report(make_vehicle(*estimate, self.t_s, **known), may_echo_ours=True)
         return self
 
     @property

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from air import HOME, SimFlight, make_match, norms
-from fakes import vehicle_at
+from fakes import make_vehicle
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Position
@@ -36,7 +36,7 @@ def use_gps_input(navigator):
     return navigator
 
 
-def sent_states(air, from_s=0.0):
+def select_states(air, from_s=0.0):
     return [(t_s, state) for t_s, state in air.states if state and t_s >= from_s]
 
 
@@ -98,10 +98,10 @@ def test_navigator_sends_positions_to_px4_only_without_gps(channel):
     navigator = Navigator(1.0, 1.0)
     navigator.handle_channel(channel)
     air = SimFlight(navigator, wind=WIND).fly(30)
-    assert not sent_states(air)
+    assert not select_states(air)
     air.lose_gps()
     air.fly(150)
-    said = sent_states(air, from_s=32.0)
+    said = select_states(air, from_s=32.0)
     assert len(said) > 0.99 * 10 * 148
     off_m = np.array([air.measure_error(state.lat_deg, state.lon_deg, t_s) for t_s, state in said])
     claimed_m = np.array([state.accuracy_m for _, state in said])
@@ -152,7 +152,7 @@ def test_navigator_streams_ten_smooth_positions_a_second():
     moved_s = air.t_s
     air.map_off = np.array([25.0, 0.0])  # two in a row are believed
     air.fly(30)
-    states = sent_states(air, moved_s - 5)
+    states = select_states(air, moved_s - 5)
     steps_s = np.diff([t_s for t_s, _ in states])
     assert steps_s == pytest.approx(0.1)
     beyond_m = []
@@ -170,7 +170,7 @@ def test_navigator_streams_ten_smooth_positions_a_second():
 
 def test_navigator_stream_stays_accurate_and_reports_its_accuracy():
     air = lose_gps(use_gps_input(Navigator(1.0, 1.0)), bias=(0.05, -0.03), fix_sd_m=2.0).fly(200)
-    states = sent_states(air, 40)
+    states = select_states(air, 40)
     assert len(states) == pytest.approx(1900, abs=3)
     off_m = np.array([air.measure_error(state.lat_deg, state.lon_deg, t_s) for t_s, state in states])
     said_m = np.array([state.accuracy_m for _, state in states]) / INFLATION
@@ -208,7 +208,7 @@ def test_report_accuracy_contains_the_attitude_error_that_images_show(shown_sd, 
     navigator, rng, height_m = Navigator(1.0, 1.0, is_level=is_level), np.random.default_rng(2), 100.0
     attitude = {"roll_deg": 0.0, "pitch_deg": 0.0, "height_m": height_m, "velocity_m_s": (0.0, 0.0)}
     for t_s in map(float, range(1, 100)):
-        vehicle = vehicle_at(*HOME, t_s, has_gps=False, position_sd_m=30.0, **attitude)
+        vehicle = make_vehicle(*HOME, t_s, has_gps=False, position_sd_m=30.0, **attitude)
         navigator.handle_vehicle(vehicle)
         shown = AttitudeError(tuple(rng.normal(0.0, shown_sd, 2)), 0.024)
         event = make_match(Position(*HOME), t_s, vehicle, 1.0, (1,), View(nadir_offset=(0.01, 0.0)), shown)

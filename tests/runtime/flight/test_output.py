@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from fakes import receiver_at, vehicle_at
+from fakes import make_receiver, make_vehicle
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Severity
@@ -25,8 +25,8 @@ def list_withdrawn(*reports):
         t_s, has_gps = BEGIN_S + after_s, known["has_gps"]
         if known.get("sent_ago_s") != math.inf:
             watch.record_sent(t_s - known.get("sent_ago_s", 0.0))
-        receiver = receiver_at(HOME, known["sd_m"], t_s, steady_for_s=known["steady_s"]) if has_gps else None
-        vehicle = vehicle_at(*offset_position(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
+        receiver = make_receiver(HOME, known["sd_m"], t_s, steady_for_s=known["steady_s"]) if has_gps else None
+        vehicle = make_vehicle(*offset_position(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
         last_fix_s = t_s - known.get("fixed_ago_s", math.inf)
         watch.update(replace(vehicle, innovation_ratio=known["ratio"]), last_fix_s, has_gps)
     return watch.withdrawn

@@ -8,7 +8,7 @@ import pytest
 from fakes import FakeClock, FakeSource
 from full_disk import limit_file_size
 from loopback import wait_until
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import read_image
@@ -33,7 +33,7 @@ def test_recording_writes_reads_and_notes_in_order(tmp_path):
 
 @pytest.mark.parametrize("is_grey", [False, True])
 def test_recording_gives_the_flight_the_stored_image(tmp_path, is_grey):
-    pictures = [textured(number, 240, 320) for number in range(3)]
+    pictures = [draw_texture(number, 240, 320) for number in range(3)]
     pictures = pictures if is_grey else [np.dstack((each, 255 - each, each // 2)) for each in pictures]
     clock = FakeClock()
     with Recording(tmp_path, 100) as tape:

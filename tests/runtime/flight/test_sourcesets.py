@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 from air import SimFlight
-from fakes import FakeClock, FakeLink, to_autopilot
+from fakes import FakeClock, FakeLink, make_output
 
 from edgevpr.core.config import SourceSetsConfig
 from edgevpr.mavlink.messages import SET_SOURCE_SET, Health
@@ -30,7 +30,7 @@ class AnsweringFlight(SimFlight):
         self.link = FakeLink(self.clock, vehicle=lambda: self.vehicle)
         stats = self.link.stats
         self.link.stats = lambda: replace(stats(), answered_s={SET_SOURCE_SET: self.asked[-1][0]} if self.asked else {})
-        self.autopilot = to_autopilot(self.link, self.navigator, self.clock, **settings)
+        self.autopilot = make_output(self.link, self.navigator, self.clock, **settings)
         super().fly(20)
 
     def fly(self, seconds):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from air import HOME, make_match
-from fakes import FakeClock, FakeLink, receiver_at, vehicle_at
+from fakes import FakeClock, FakeLink, make_receiver, make_vehicle
 
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import move_position, offset_m, offset_position, picture_axes
@@ -32,28 +32,28 @@ GPS_TAU_S = 60.0
 VIEW = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0))
 
 
-def circle(t_s):
+def fly_circle(t_s):
     """Position (2,) and heading in a circle of 300 m."""
     turn = t_s * SPEED_M_S / 300
     return 300 * np.array([1 - math.cos(turn), math.sin(turn)]), math.degrees(turn)
 
 
-def eight(t_s):
+def fly_eights(t_s):
     """The like in two circles beside each other, the one to the right and the other to the left."""
     round_s = 2 * math.pi * 300 / SPEED_M_S
-    at_m, heading_deg = circle(t_s % round_s)
+    at_m, heading_deg = fly_circle(t_s % round_s)
     side = 1 if t_s % (2 * round_s) < round_s else -1
     return at_m * (side, 1), side * heading_deg
 
 
-def lanes(t_s):
+def fly_lanes(t_s):
     """The like over lanes of 600 m, side by side, without the turns between them."""
     lane, share = divmod(t_s * SPEED_M_S / 600, 1)
     is_back = lane % 2
     return np.array([60 * lane, 600 * (1 - share if is_back else share)]), 180.0 * is_back
 
 
-def line(t_s):
+def fly_line(t_s):
     return np.array([0.0, SPEED_M_S * t_s]), 0.0
 
 
@@ -73,11 +73,11 @@ def make_matches(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, 
         velocity = np.clip((after_m - at_m) / 0.01, -SPEED_M_S, SPEED_M_S)
         told_deg = (heading_deg + compass_deg) % 360
         known = {"heading_deg": told_deg, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
-        known |= {"velocity_m_s": tuple(velocity), "gps": receiver_at(gps, GPS_SD_M, t_s)} | said
+        known |= {"velocity_m_s": tuple(velocity), "gps": make_receiver(gps, GPS_SD_M, t_s)} | said
         event = make_match(
             Position(*offset_position(*HOME, *fix_m)),
             t_s,
-            vehicle_at(*gps, t_s, **known),
+            make_vehicle(*gps, t_s, **known),
             FIX_SD_M,
             (int(t_s),),
             replace(VIEW, up_deg=told_deg),
@@ -99,7 +99,7 @@ def measure_offset_error_m(found):
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
-@pytest.mark.parametrize("way", [eight, lanes])
+@pytest.mark.parametrize("way", [fly_eights, fly_lanes])
 def test_survey_separates_offset_scale_and_mount(way, wrong):
     for seed in range(4):
         found = run_survey(way, 900, seed=seed, wrong=wrong)
@@ -112,26 +112,28 @@ def test_survey_separates_offset_scale_and_mount(way, wrong):
 
 def test_survey_standard_deviations_match_the_errors():
     """Over many flights the errors are as large as is said, neither half nor double of it."""
-    found = [run_survey(eight, 600, seed=seed) for seed in range(30)]
+    found = [run_survey(fly_eights, 600, seed=seed) for seed in range(30)]
     shares = np.array([measure_offset_error_m(each) / each.measures["off_m"].sd for each in found])
     assert 0.5 < np.sqrt(np.mean(shares**2)) < 1.2
     shares = np.array([(each.measures["scale"].value[0] - SCALE) / each.measures["scale"].sd for each in found])
     assert 0.5 < np.sqrt(np.mean(shares**2)) < 1.2
 
 
-@pytest.mark.parametrize(("way", "wrong", "known"), [(circle, 0.0, ["off_m", "ahead_deg"]), (line, 0.05, ["scale"])])
+@pytest.mark.parametrize(
+    ("way", "wrong", "known"), [(fly_circle, 0.0, ["off_m", "ahead_deg"]), (fly_line, 0.05, ["scale"])]
+)
 def test_survey_finds_only_what_the_route_separates(way, wrong, known):
     found = run_survey(way, 900, wrong=wrong)
     assert [name for name, each in found.measures.items() if each.is_known] == known
-    assert (found.fields()["off_m"] is None) == (way is line)
-    if way is circle:
+    assert (found.fields()["off_m"] is None) == (way is fly_line)
+    if way is fly_circle:
         assert np.abs(measure_offset_error_m(found)).max() < 2.5 * found.measures["off_m"].sd
         ahead = found.measures["ahead_deg"]
         assert ahead.value[0] == pytest.approx(AHEAD_DEG, abs=2 * ahead.sd)
 
 
 def test_survey_measures_the_mount_from_image_rotation_with_a_wrong_compass():
-    found = run_survey(lanes, 600, compass_deg=90.0)
+    found = run_survey(fly_lanes, 600, compass_deg=90.0)
     assert found.measures["ahead_deg"].value[0] == pytest.approx(AHEAD_DEG, abs=1.0)
     assert found.measures["right_deg"].value[0] == pytest.approx(RIGHT_DEG, abs=1.0)
 
@@ -145,22 +147,22 @@ def test_survey_measures_the_mount_from_image_rotation_with_a_wrong_compass():
         {"roll_deg": None},
         {"velocity_m_s": (math.nan, 0.0)},
         {"gps": None},
-        {"gps": receiver_at(HOME, 8.0, 0.0)},
+        {"gps": make_receiver(HOME, 8.0, 0.0)},
     ],
 )
 def test_survey_finds_nothing_without_gps_or_attitude(said):
-    assert run_survey(lanes, 300, **said) is None
+    assert run_survey(fly_lanes, 300, **said) is None
 
 
 def test_survey_uses_the_receiver_and_not_a_position_derived_from_ours():
     """After a fix of ours the autopilot may repeat it: the receiver itself counts, which is 0.1 s late here."""
     rng = np.random.default_rng(3)
     sightings = MapSurvey(STRAIGHT_DOWN, is_level=False)
-    for event in make_matches(lanes, 900):
+    for event in make_matches(fly_lanes, 900):
         vehicle, v = event.vehicle, event.vehicle.velocity_m_s
         late = offset_position(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
         ours = offset_position(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
-        gps = receiver_at(late, GPS_SD_M, event.frame.t_mono_s)
+        gps = make_receiver(late, GPS_SD_M, event.frame.t_mono_s)
         vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
         sightings.add_match(replace(event, vehicle=vehicle))
     found = sightings.compute_result()
@@ -201,7 +203,7 @@ class SurveyRun:
 
 
 def test_survey_is_reported_once_and_at_the_end(tmp_path):
-    flown = SurveyRun(tmp_path, make_matches(eight, 1800))
+    flown = SurveyRun(tmp_path, make_matches(fly_eights, 1800))
     *_, last = flown.lines
     assert 2 <= len(flown.lines) <= 5, "one for each that becomes known, and the end"
     assert last["t_mono_s"] == flown.last
@@ -213,7 +215,7 @@ def test_survey_is_reported_once_and_at_the_end(tmp_path):
     assert all(len(text.encode()) <= 50 and not text.endswith("...") for text in flown.texts)
 
 
-def make_correct_matches(way=lanes, seconds=900):
+def make_correct_matches(way=fly_lanes, seconds=900):
     """The matches of a map and a camera that are right."""
     rng = np.random.default_rng(2)
     for event in make_matches(way, seconds):
@@ -239,7 +241,7 @@ def mislead(law, flight):
         yield replace(event, vehicle=replace(vehicle, lat_deg=there[0], lon_deg=there[1], gps=gps))
 
 
-@pytest.mark.parametrize("way", [eight, circle])
+@pytest.mark.parametrize("way", [fly_eights, fly_circle])
 @pytest.mark.parametrize(
     "law",
     [
@@ -256,7 +258,7 @@ def test_survey_learns_nothing_from_wrong_gps(tmp_path, law, way):
 
 
 def test_survey_withdraws_its_report_when_gps_becomes_wrong(tmp_path):
-    flown = SurveyRun(tmp_path, mislead(lambda t_s: 60.0 * (t_s > 700), make_matches(eight, 1200)))
+    flown = SurveyRun(tmp_path, mislead(lambda t_s: 60.0 * (t_s > 700), make_matches(fly_eights, 1200)))
     assert flown.lines[0]["off_m"]
     assert "off_m" not in flown.lines[-1]
     assert flown.lines[-1]["note"]["code"] == "SURVEY_WITHDRAWN"
@@ -264,7 +266,7 @@ def test_survey_withdraws_its_report_when_gps_becomes_wrong(tmp_path):
 
 
 @pytest.mark.parametrize("map_sd_m", [5.0, 1.0])
-@pytest.mark.parametrize("way", [eight, lanes, circle])
+@pytest.mark.parametrize("way", [fly_eights, fly_lanes, fly_circle])
 def test_images_are_levelled_by_the_measured_mount_so_that_gps_agrees(tmp_path, way, map_sd_m):
     flown = SurveyRun(tmp_path, make_matches(way, 1800, scale=0.0), map_sd_m)
     known_s = next(line["t_mono_s"] for line in flown.lines if line["ahead_deg"])
@@ -272,12 +274,12 @@ def test_images_are_levelled_by_the_measured_mount_so_that_gps_agrees(tmp_path, 
     assert flown.alarms_s, "until then, each turn contradicts GPS"
     assert all(t_s < known_s + 10 for t_s in flown.alarms_s)
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5)
-    right_deg = 0.0 if way is circle else RIGHT_DEG  # in one circle that is a scale, and not taken for known
+    right_deg = 0.0 if way is fly_circle else RIGHT_DEG  # in one circle that is a scale, and not taken for known
     assert flown.mounts[-1].right_deg == pytest.approx(right_deg, abs=1.5)
     assert flown.lines[-1]["ahead_deg"] == pytest.approx(AHEAD_DEG, abs=1.0), "it is still what is to be set"
 
 
 def test_survey_finds_spoofed_gps_after_measuring_the_mount(tmp_path):
-    flown = SurveyRun(tmp_path, mislead(lambda t_s: max(0.0, t_s - 1500), make_matches(eight, 1800, scale=0.0)))
+    flown = SurveyRun(tmp_path, mislead(lambda t_s: max(0.0, t_s - 1500), make_matches(fly_eights, 1800, scale=0.0)))
     assert 1500 < min(t_s for t_s in flown.alarms_s if t_s > 1450) < 1530
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5), "a mount that is known stays"

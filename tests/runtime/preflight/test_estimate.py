@@ -29,7 +29,7 @@ def accuracies(monkeypatch):
     return table
 
 
-def trials(costs):
+def make_trials(costs):
     return [Trial(label=label, name=label.split()[0], settings={}, costs=each) for label, each in costs.items()]
 
 
@@ -40,7 +40,7 @@ def on_this_board(monkeypatch):
 
 
 def estimate(costs, plan=PLAN, board=PI):
-    return estimate_flight(board, trials(costs), plan)
+    return estimate_flight(board, make_trials(costs), plan)
 
 
 @pytest.mark.usefixtures("on_this_board")

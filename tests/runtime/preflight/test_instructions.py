@@ -18,7 +18,7 @@ PI = load_board("rpi-4b")
 def test_compute_costs_scales_counted_instructions_but_not_memory():
     work = count_work("cohog", {"camera": "nadir"})
     there = compute_costs(REGIONS, PI, work)
-    parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
+    parts, rate_hz = read_instructions(), 1e6 * PI.benchmark_score.arm64_mips
     assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
     query_s = there.encode.wall_s + replace(there, candidates=30).match(10_000).wall_s
     landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]
@@ -38,6 +38,6 @@ def test_count_work_is_none_for_uncounted_settings():
     assert count_work("hog", {}) is None
 
 
-def counted_parts():
+def read_instructions():
     results = Path(__file__).parents[3] / "benchmarks" / "results" / "arm64.json"
     return {row["part"]: row["instructions"] for row in json.loads(results.read_text())["parts"]}

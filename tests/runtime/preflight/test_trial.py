@@ -9,7 +9,7 @@ from edgevpr.runtime.preflight import trial
 from edgevpr.runtime.preflight.trial import list_trials, run_trials
 
 
-def kill_at_hog(trials, threads):
+def kill_hog_trial(trials, threads):
     if trials[0].name == "hog":
         os.kill(os.getpid(), signal.SIGKILL)
     return trials
@@ -18,7 +18,7 @@ def kill_at_hog(trials, threads):
 @pytest.mark.process
 @pytest.mark.usefixtures("models")
 def test_run_trials_reports_a_process_that_dies_and_continues(monkeypatch):
-    monkeypatch.setattr(trial, "_run_in_child", kill_at_hog)
+    monkeypatch.setattr(trial, "_run_in_child", kill_hog_trial)
     found = list(run_trials([*list_trials(["hog"]), *list_trials(["seqslam"])], threads=1))
     assert [each.label for each in found] == ["hog", "seqslam"], "one row for all forms of what cannot be used"
     assert "crashed" in found[0].problem

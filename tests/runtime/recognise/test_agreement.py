@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from pictures import rough_ground, textured
+from pictures import draw_rough_ground, draw_texture
 
 from edgevpr.runtime.recognise.agreement import (
     MIN_CONFIRMED_INLIERS,
@@ -22,7 +22,7 @@ HEIGHT_PX = 480
 @pytest.fixture(scope="module")
 def landscape():
     """Ground with patches of all sizes, from which pictures are cut."""
-    return rough_ground(1600)
+    return draw_rough_ground(1600)
 
 
 def cut_picture(landscape, x, y, up_deg=0.0, scale=1.0):
@@ -75,7 +75,7 @@ def test_measure_agreement_has_the_signs_of_a_cohog_match(landscape, right_px, d
 
 @pytest.mark.parametrize("seed", range(6))
 def test_pictures_of_other_ground_do_not_agree(landscape, seed):
-    other = textured(100 + seed, HEIGHT_PX, WIDTH_PX)
+    other = draw_texture(100 + seed, HEIGHT_PX, WIDTH_PX)
     expected = Overlay((0.05 * (seed % 3), -0.05), 15.0 * seed)
     found = compare_near(detect_query(other), detect_stored(cut_picture(landscape, 800, 600)), expected)
     assert found.inliers < MIN_CONFIRMED_INLIERS

@@ -9,7 +9,7 @@ import zlib
 from dataclasses import asdict, replace
 
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map
 
 from edgevpr.core.config import load_config
@@ -42,7 +42,7 @@ CALIBRATION = MapCalibration(
 
 def frame(number):
     position = Position(50 + 0.001 * number, 8.0)
-    return Frame(image=textured(number, 240, 320), name=str(number), t_mono_s=0.0, position=position)
+    return Frame(image=draw_texture(number, 240, 320), name=str(number), t_mono_s=0.0, position=position)
 
 
 @pytest.fixture(scope="module")

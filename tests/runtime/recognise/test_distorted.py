@@ -4,8 +4,8 @@ import math
 
 import cv2
 import pytest
-from distorted_cameras import DistortedCamera, fisheye, wide
-from pictures import rough_ground
+from distorted_cameras import DistortedCamera, make_fisheye_camera, make_wide_camera
+from pictures import draw_rough_ground
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
@@ -22,7 +22,11 @@ pytestmark = pytest.mark.slow
 ORIGIN = 50.0, 8.0
 M_PER_PX = 0.25
 FOCAL_PX = 493.0
-CAMERAS = {"straight": DistortedCamera(FOCAL_PX, (0,) * 4), "wide": wide(), "fisheye": fisheye()}
+CAMERAS = {
+    "straight": DistortedCamera(FOCAL_PX, (0,) * 4),
+    "wide": make_wide_camera(),
+    "fisheye": make_fisheye_camera(),
+}
 SEEN_DEG = {"straight": 2 * math.degrees(math.atan(320 / FOCAL_PX)), "wide": 101.0, "fisheye": 136.0}
 STRAIGHT = {"height_m": 100.0, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0}
 ROUTE_M = [
@@ -34,7 +38,7 @@ ROUTE_M = [
 
 @pytest.fixture(scope="module")
 def ground():
-    return rough_ground(2000)
+    return draw_rough_ground(2000)
 
 
 @pytest.fixture(scope="module")

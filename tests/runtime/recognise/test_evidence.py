@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sureness import agreeing, make_bare_index
+from sureness import make_agreement, make_bare_index
 
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode
@@ -61,7 +61,7 @@ def test_evidence_has_the_features_of_the_models():
     for kind, evidence in (
         (AHEAD, see_forward({5: forward(0.2)})),
         (AHEAD_PROVEN, replace(see_forward({5: forward(0.2)}), proof=0.1)),
-        (DOWN, see_down(down, agreeing(12))),
+        (DOWN, see_down(down, make_agreement(12))),
         (DOWN_BARE, see_down(down)),
     ):
         assert evidence.kind == kind
@@ -143,10 +143,10 @@ def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_a
 @pytest.mark.parametrize(
     ("proof", "counts"),
     [
-        (agreeing(12), 12),
-        (agreeing(12, is_expected=False), 0),
-        (agreeing(12, shift_share=(0.0, 0.001)), 0),
-        (agreeing(0), 0),
+        (make_agreement(12), 12),
+        (make_agreement(12, is_expected=False), 0),
+        (make_agreement(12, shift_share=(0.0, 0.001)), 0),
+        (make_agreement(0), 0),
     ],
 )
 def test_landmarks_count_only_if_expected_and_shifted(proof, counts):
@@ -190,7 +190,7 @@ def test_require_usable_refuses_a_model_of_other_evidence():
 
 def test_chance_is_lower_with_a_known_heading():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
-    all_of_them, known = (see_down(matches, agreeing(3), tried=tried).figures() for tried in (1.0, 1 / 8))
+    all_of_them, known = (see_down(matches, make_agreement(3), tried=tried).figures() for tried in (1.0, 1 / 8))
     model = read_default_model(DOWN)
     assert 0 < model.chance(known) == pytest.approx(model.chance(all_of_them) / 4)
     assert model.confidence(known) > model.confidence(all_of_them)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from sureness import make_rule
 from walks import make_map, walk_over
 
@@ -30,7 +30,7 @@ TECHNIQUE = create("cohog", {"w1": 208})
 def frame(place, t_s=0.0, position=True):
     shown = DUPLICATE_PLACES[0] if place == DUPLICATE_PLACES[1] else place
     there = Position(50 + place * 0.0002, 8.0) if position else None
-    return Frame(image=textured(shown), name=f"{place}.png", t_mono_s=t_s, t_utc_s=t_s, position=there)
+    return Frame(image=draw_texture(shown), name=f"{place}.png", t_mono_s=t_s, t_utc_s=t_s, position=there)
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["positions", "in order"])
@@ -133,6 +133,6 @@ def test_tracked_flight_accepts_no_unmapped_ground(whole_map):
     with PlaceMap.open(whole_map) as place_map:
         walk = TrackedWalk(place_map, rule)
         assert [walk.query(place).accepted for place in range(1, 16, STRIDE)][-1]
-        away = [walk.query(0, image=textured(900 + look)) for look in range(10)]
+        away = [walk.query(0, image=draw_texture(900 + look)) for look in range(10)]
     assert not any(event.accepted for event in away)
     assert all(event.track.lost > 0.5 for event in away[5:])

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pictures_of_nothing
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map
 
 from edgevpr.core.config import load_config
@@ -28,7 +28,7 @@ def walk(request, tmp_path_factory):
     """A recogniser of six places, as a flight opens it."""
     path = tmp_path_factory.mktemp("map") / "m.gpkg"
     config, board = load_config(None, {"map": str(path), "source.camera": request.param}), load_board("this")
-    frames = (frame(textured(number, 240, 320), f"{number}.png") for number in range(PLACES))
+    frames = (frame(draw_texture(number, 240, 320), f"{number}.png") for number in range(PLACES))
     make_map(path, create("cohog", {"camera": request.param}), frames)
     recogniser = open_recogniser(config, board)
     with recogniser.place_map:
@@ -44,7 +44,7 @@ def test_step_does_not_search_images_without_information(walk):
     assert event.reason.code is ReasonCode.LOW_TEXTURE
     assert event.reason.parameters["min_share"] == 0.4
     assert event.steps.scan == event.steps.compare == NO_COST, "the search is saved"
-    after = walk.step(frame(textured(3, 240, 320)))
+    after = walk.step(frame(draw_texture(3, 240, 320)))
     assert (after.accepted, after.lacks_texture, after.best.place.source_image) == (True, False, "3.png")
 
 
@@ -57,7 +57,7 @@ def test_step_accepts_no_image_of_an_unreal_scene(walk):
 def test_step_accepts_only_the_correct_place_for_a_mostly_hidden_image(walk):
     recognised = 0
     for number in (2, 5):
-        for kind, picture in pictures_of_nothing.yield_spoilt(9000 + number, textured(number, 240, 320)):
+        for kind, picture in pictures_of_nothing.yield_spoilt(9000 + number, draw_texture(number, 240, 320)):
             event = walk.step(frame(picture, kind))
             assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
             recognised += event.accepted

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from pictures import view_at
+from pictures import draw_view
 from walks import make_map, walk_over
 
 from edgevpr.core.types import Frame, Pose, Position
@@ -21,7 +21,7 @@ PLACES = 4
 
 def frame(place, height_ratio=1.0):
     return Frame(
-        image=view_at(place, height_ratio), name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0)
+        image=draw_view(place, height_ratio), name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0)
     )
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fakes import vehicle_at
+from fakes import make_vehicle
 from sureness import make_bare_index
 
 from edgevpr.core.contract import FineMatch
@@ -36,7 +36,7 @@ def index():
 
 
 def vehicle(position, t_received_s):
-    return vehicle_at(position.lat_deg, position.lon_deg, t_received_s)
+    return make_vehicle(position.lat_deg, position.lon_deg, t_received_s)
 
 
 def place_match(metres=0.0, heading_deg=None, rotation_deg=None):

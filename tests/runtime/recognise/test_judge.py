@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sureness import NEEDED, FixedModel, agreeing, make_bare_index, make_model, make_rule
+from sureness import NEEDED, FixedModel, make_agreement, make_bare_index, make_model, make_rule
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch
@@ -253,7 +253,9 @@ def test_is_unshifted_requires_no_shift_rotation_or_height_change(shift_cells, r
 def test_judge_requires_landmarks_against_a_place_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
     evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
-    verdict = decide((0.15, 0.14), make_rule(lambda evidence: 1.0), agreement=agreeing(inliers), evidence=evidence)
+    verdict = decide(
+        (0.15, 0.14), make_rule(lambda evidence: 1.0), agreement=make_agreement(inliers), evidence=evidence
+    )
     assert verdict.accepted is accepted
     parameters = verdict.reason.parameters
     assert (parameters["landmarks"], parameters["rival_landmarks"]) == (inliers, rival)
@@ -266,13 +268,13 @@ def test_judge_requires_landmarks_against_a_place_that_agrees_nearly_as_well(lea
 @pytest.mark.parametrize(
     ("score", "proof", "accepted"),
     [
-        (0.3, agreeing(4), False),
-        (0.3, agreeing(0), False),
-        (0.3, agreeing(5), True),
-        (0.3, agreeing(0, possible=99), True),
-        (0.3, agreeing(0, possible=100), False),
-        (0.19, agreeing(0), True),
-        (0.12, agreeing(30, is_expected=False), False),
+        (0.3, make_agreement(4), False),
+        (0.3, make_agreement(0), False),
+        (0.3, make_agreement(5), True),
+        (0.3, make_agreement(0, possible=99), True),
+        (0.3, make_agreement(0, possible=100), False),
+        (0.19, make_agreement(0), True),
+        (0.12, make_agreement(30, is_expected=False), False),
     ],
 )
 def test_judge_refuses_a_clear_vote_without_agreeing_landmarks(score, proof, accepted):

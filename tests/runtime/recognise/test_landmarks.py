@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 
 from edgevpr.places.rows import MAX_LANDMARK_BYTES
 from edgevpr.runtime.recognise.landmarks import (
@@ -16,7 +16,7 @@ from edgevpr.runtime.recognise.landmarks import (
 
 @pytest.fixture(scope="module")
 def ground():
-    return textured(1, 480, 640)
+    return draw_texture(1, 480, 640)
 
 
 def test_detect_landmarks_spreads_them_over_the_image_around_its_centre(ground):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from fakes import vehicle_at
-from pictures import rough_ground
+from fakes import make_vehicle
+from pictures import draw_rough_ground
 from walks import make_map, walk_over
 
 from edgevpr.core.config import load_config
@@ -37,7 +37,7 @@ LEVEL_POSE = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_
 
 @pytest.fixture(scope="module")
 def ground():
-    return cv2.cvtColor(rough_ground(2400), cv2.COLOR_GRAY2BGR)
+    return cv2.cvtColor(draw_rough_ground(2400), cv2.COLOR_GRAY2BGR)
 
 
 def frame(ground, place, t_mono_s=0.0, told=None, **pose):
@@ -74,11 +74,11 @@ def place_map(ground, technique, tmp_path_factory):
 
 @pytest.fixture
 def walk(place_map, technique):
-    def of(levelling, prior=None, mask=None):
+    def make_walk(levelling, prior=None, mask=None):
         encoder = {"levelling": levelling, "mask": mask}
         return walk_over(place_map, technique, settings=MatchSettings(), encoder=encoder, prior=prior)
 
-    return of
+    return make_walk
 
 
 def make_scaling(is_live=False):
@@ -203,7 +203,7 @@ def test_prepare_reports_the_tilt_of_an_image_without_a_lens(roll_deg, pitch_deg
     to_pixel = ground_to_pixel(pose, camera)
     east, north, scale = np.linalg.solve(to_pixel, (camera.width / 2 - 0.5, camera.height / 2 - 0.5, 1.0))
     told = how | {"height_m": 80.0}
-    vehicle = vehicle_at(50.0, 8.0, 5.0, **told)
+    vehicle = make_vehicle(50.0, 8.0, 5.0, **told)
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0)
     view = Levelling(None, is_live=True).prepare(frame, vehicle, None).view
     assert view.nadir_offset_m == pytest.approx((-east / scale, -north / scale), abs=0.15)
@@ -221,7 +221,7 @@ def test_prepare_reports_too_large_a_tilt_and_no_view_without_a_heading():
 def test_prepare_ignores_the_attitude_with_a_gimbal():
     frame = Frame(image=np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8), name="", t_mono_s=5.0)
     told = {"heading_deg": 30.0, "height_m": 80.0}
-    banked, level = (vehicle_at(50.0, 8.0, 5.0, roll_deg=roll, pitch_deg=5.0 * roll, **told) for roll in (9.0, 0.0))
+    banked, level = (make_vehicle(50.0, 8.0, 5.0, roll_deg=roll, pitch_deg=5.0 * roll, **told) for roll in (9.0, 0.0))
     hung = Levelling(Lens(66.0), is_on_gimbal=True, is_live=True).prepare(frame, banked, None)
     fixed = Levelling(Lens(66.0), is_live=True).prepare(frame, level, None)
     assert hung.view == fixed.view
@@ -235,7 +235,7 @@ def test_prepare_applies_the_configured_mount_with_and_without_lens_or_gimbal(te
     for gimbal in (False, True):
         config = load_config(None, said | {"source.gimbal": gimbal}).source
         frame = Frame(image=np.zeros((480, 640), np.uint8), name="", t_mono_s=5.0)
-        vehicle = vehicle_at(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
+        vehicle = make_vehicle(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
         view = make_levelling(config, technique).prepare(frame, vehicle, None, layers=LAYER).view
         off_m = view.nadir_offset_m if fov_deg is None else FOOTPRINT_M * np.array(view.nadir_offset)
         assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sureness import agreeing
+from sureness import make_agreement
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_position, project_to_metres
@@ -72,14 +72,14 @@ def test_locate_gives_the_position_of_the_aircraft_not_of_the_image_centre(turne
 
 
 def test_locate_scales_the_nadir_offset_with_the_height():
-    proof = agreeing(20, (0.0, 0.0), scale=2.0)
+    proof = make_agreement(20, (0.0, 0.0), scale=2.0)
     found = locate([candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
     assert measure_offset_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_locate_prefers_landmarks_to_the_vote():
-    proof = agreeing(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
+    proof = make_agreement(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
     by_vote = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)))
     found = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from fakes import vehicle_at
+from fakes import make_vehicle
 from sureness import make_model
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
@@ -58,7 +58,7 @@ class Flight:
     def advance(self, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None):
         """Go on, `moved_m` (east, north) by the camera's own motion."""
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
-        vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
+        vehicle = make_vehicle(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
         stride = moved_m and OdometryStep(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
         self.follower.predict(Frame(image=BLANK, name="", t_mono_s=self.t_s), vehicle, stride)
 

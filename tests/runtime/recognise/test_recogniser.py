@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map, walk_over
 
 from edgevpr.core.config import load_config
@@ -24,7 +24,7 @@ RULE = AcceptRule(min_score=0.07, min_margin=0.06, neighbour_m=50.0)
 
 def frame(number, t_mono_s=0.0):
     position = Position(50 + number * 0.001, 8.0)
-    return Frame(image=textured(number), name=f"{number}.png", t_mono_s=t_mono_s, position=position)
+    return Frame(image=draw_texture(number), name=f"{number}.png", t_mono_s=t_mono_s, position=position)
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +77,11 @@ class LibraryError(Exception):
 )
 @pytest.mark.parametrize("where", ["encode", "score_places", "match"])
 def test_step_refuses_with_the_reason_of_any_exception_of_a_technique(walk, error, where):
-    def broken(*asked, **more):
+    def raise_error(*asked, **more):
         raise error
 
     whole = getattr(walk.technique, where)
-    setattr(walk.technique, where, broken)
+    setattr(walk.technique, where, raise_error)
     event = walk.step(frame(1))
     assert (event.failed, event.accepted, event.position) == (True, False, None)
     assert event.is_query == (where != "encode")
@@ -96,10 +96,10 @@ def test_step_lets_a_stop_pass(walk):
     class Stop(BaseException):
         pass
 
-    def stopped(*asked):
+    def raise_stop(*asked):
         raise Stop
 
-    walk.technique.encode = stopped
+    walk.technique.encode = raise_stop
     with pytest.raises(Stop):
         walk.step(frame(1))
 
@@ -120,7 +120,7 @@ def test_recogniser_never_claims_better_than_the_minimum_accuracy(walk):
 
 def test_step_ignores_places_of_the_same_ground_as_rivals(tmp_path):
     """A place 60 m on is beyond `neighbour_m`, and half of its ground is the same."""
-    technique, ground, side_px = create("cohog", {"camera": "nadir"}), textured(9, 256, 2048), 256
+    technique, ground, side_px = create("cohog", {"camera": "nadir"}), draw_texture(9, 256, 2048), 256
     pose = Pose(up_deg=0.0, footprint_m=128.0, covariance_m2=(1.0, 0.0, 1.0))
 
     def cut(east_m):

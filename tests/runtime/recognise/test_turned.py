@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import draw_texture
 from walks import make_map, walk_over
 
 from edgevpr.core.reasons import ReasonCode
@@ -18,7 +18,7 @@ SYMMETRIC_PLACE = 2  # the place that looks the same from its other end
 
 
 def frame(place, shift_px=0, heading_deg=None):
-    ground = textured(place, 500, 500)
+    ground = draw_texture(place, 500, 500)
     if place == SYMMETRIC_PLACE:
         ground = np.uint8(np.rint((ground.astype(float) + ground[::-1, ::-1]) / 2))
     image = ground[50 + shift_px : 434 + shift_px, 50:434]

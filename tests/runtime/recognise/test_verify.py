@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from map_writer import write_sql
 from pictures_of_nothing import figures
-from sureness import make_model, make_rule, rate_by_landmarks
+from sureness import make_model, make_rule, rate_landmarks
 from walks import make_map, walk_over
 
 from edgevpr.core.reasons import ReasonCode
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 PLACES = 4
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
-BY_LANDMARKS = make_rule(rate_by_landmarks)
+BY_LANDMARKS = make_rule(rate_landmarks)
 
 
 def ground(seed):
@@ -172,19 +172,26 @@ def test_verify_does_not_accept_nearly_duplicate_ground_by_landmarks(tmp_path, t
     assert event.reason.code is ReasonCode.LOW_CONFIDENCE
 
 
-def unplaced(seed, right_px=0, down_px=0):
+def make_bare_frame(seed, right_px=0, down_px=0):
     return replace(frame(seed, right_px, down_px), position=None)
 
 
 @pytest.fixture(scope="module")
 def overlapping(tmp_path_factory, technique):
     """Places without positions: the first, the fifth and the eighth show the same ground."""
-    same, other = [unplaced(1, -25, -10), unplaced(1, 25, 10), unplaced(1, 0, 28)], list(map(unplaced, range(2, 7)))
+    same, other = (
+        [
+            make_bare_frame(1, -25, -10),
+            make_bare_frame(1, 25, 10),
+            make_bare_frame(1, 0, 28),
+        ],
+        list(map(make_bare_frame, range(2, 7))),
+    )
     order = [same[0], *other[:3], same[1], *other[3:], same[2]]
     return make_map(tmp_path_factory.mktemp("overlapping") / "m.gpkg", technique, order)
 
 
-def same_ground(path, technique, query):
+def find_same_ground(path, technique, query):
     """The best place of a query, and the numbers of the places that show the same ground."""
     with PlaceMap.open(path) as place_map:
         walk = walk_over(place_map, technique, BY_LANDMARKS, settings=MatchSettings())
@@ -194,8 +201,8 @@ def same_ground(path, technique, query):
 
 
 def test_verify_treats_overlapping_places_without_positions_as_the_same_ground(overlapping, technique):
-    for query in (unplaced(1, 3, 2), unplaced(1, -15, 5)):
-        event, best, same = same_ground(overlapping, technique, query)
+    for query in (make_bare_frame(1, 3, 2), make_bare_frame(1, -15, 5)):
+        event, best, same = find_same_ground(overlapping, technique, query)
         assert {best, *same} == {1, 5, 8}
         assert event.accepted
         assert event.evidence.lead > math.log(1.5), "places of the same ground are no rivals"

@@ -6,8 +6,8 @@ import signal
 
 import pytest
 import yaml
-from commands import refused
-from flight_process import ended, simulated_autopilot, start, wait_for
+from commands import expect_refusal
+from flight_process import finish_flight, serve_autopilot, start, wait_for
 from flights import PLACES, select
 from mavlink_peers import Peer, UdpPort
 
@@ -26,12 +26,12 @@ FAST_RATE = "--rate-hz", "15"
 def fly(recording, tmp_path):
     """Start a recorded flight over the map's own pictures; its log is `tmp_path`/flight.jsonl."""
 
-    def started(*flags, place_map=None, pictures=None):
+    def start_flight(*flags, place_map=None, pictures=None):
         place_map = place_map or recording / "cohog.gpkg"
         pictures = pictures or recording / "blind" / "images"
         return start(place_map, pictures, tmp_path / "flight.jsonl", "--record", str(tmp_path / "recorded"), *flags)
 
-    return started
+    return start_flight
 
 
 def replay_and_compare(log, **how):
@@ -46,8 +46,8 @@ def replay_and_compare(log, **how):
 
 
 def test_replay_of_an_ardupilot_flight_is_identical(fly, tmp_path):
-    with simulated_autopilot() as (link, _):
-        ended(fly("--link", link, *FAST_RATE))
+    with serve_autopilot() as (link, _):
+        finish_flight(fly("--link", link, *FAST_RATE))
     again, lines = replay_and_compare(tmp_path / "flight.jsonl")
     assert again.why_ended is None
     assert lines.after == 0
@@ -58,21 +58,21 @@ def test_replay_of_an_ardupilot_flight_is_identical(fly, tmp_path):
 
 
 def test_replay_of_a_px4_flight_is_identical(fly, tmp_path):
-    with simulated_autopilot(vehicle="px4-plane") as (link, _):
-        ended(fly("--link", link, "--rate-hz", "8"))
+    with serve_autopilot(vehicle="px4-plane") as (link, _):
+        finish_flight(fly("--link", link, "--rate-hz", "8"))
     again, _ = replay_and_compare(tmp_path / "flight.jsonl")
     assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0
 
 
 def test_replay_includes_signals_and_a_closed_terminal(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
-    with simulated_autopilot() as (link, _):
+    with serve_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "5")
         wait_for("query", log, flight)
         flight.send_signal(signal.SIGHUP)
         wait_for("query", log, flight, count=5)
         flight.send_signal(signal.SIGTERM)
-        ended(flight)
+        finish_flight(flight)
     again, _ = replay_and_compare(log)
     assert again.why_ended is None
 
@@ -84,7 +84,7 @@ def test_replay_of_a_flight_timed_by_its_images_is_identical(fly, recording, tmp
         shutil.copy(recording / "blind" / "images" / picture, tmp_path / picture)
         rows.append(f"{picture},,,{1000 + 0.1 * number:.1f}")
     (tmp_path / "positions.csv").write_text("\n".join(["file,lat,lon,time", *rows]))
-    ended(fly("--rate-hz", "0.02", pictures=tmp_path))
+    finish_flight(fly("--rate-hz", "0.02", pictures=tmp_path))
     (tape,) = (tmp_path / "recorded").glob(f"*/{TAPE}")  # an earlier build had more keys of a board
     tape.write_text(tape.read_text().replace('"arm64_mips": ', '"single": 1.0, "arm64_mips": ', 1))
     assert '"single": 1.0' in tape.read_text()
@@ -95,11 +95,11 @@ def test_replay_of_a_flight_timed_by_its_images_is_identical(fly, recording, tmp
 
 def test_replay_of_a_killed_flight_ends_with_its_tape(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
-    with simulated_autopilot() as (link, _):
+    with serve_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "10")
         wait_for("query", log, flight, count=12)
         flight.kill()
-        ended(flight, -signal.SIGKILL)
+        finish_flight(flight, -signal.SIGKILL)
     again, _ = replay_and_compare(log)
     assert again.why_ended
     assert len(select(again.lines, "query")) >= 2, "what is half a second old is on the disk"
@@ -123,7 +123,7 @@ def test_replay_ignores_only_the_signature_of_signed_packets(fly, tmp_path):
     unsigned = Peer(port)
     assert unsigned.expect("HEARTBEAT").get_header().incompat_flags == mavlink.MAVLINK_IFLAG_SIGNED
     unsigned.heartbeat()
-    ended(flight)
+    finish_flight(flight)
     port.close()
     again, _ = replay_and_compare(tmp_path / "flight.jsonl")
     assert (tmp_path / "time").exists()
@@ -134,7 +134,7 @@ def test_replay_ignores_only_the_signature_of_signed_packets(fly, tmp_path):
 
 
 def test_replay_reports_a_different_answer_of_a_technique(fly, tmp_path, monkeypatch, capsys):
-    ended(fly(*FAST_RATE))
+    finish_flight(fly(*FAST_RATE))
     log = str(tmp_path / "flight.jsonl")
     assert main(["replay", log]) == 0
     assert " 0 differ" in capsys.readouterr().out
@@ -148,15 +148,15 @@ def test_replay_reports_a_different_answer_of_a_technique(fly, tmp_path, monkeyp
 
 def test_replay_reports_missing_files(fly, recording, tmp_path, capsys):
     log = tmp_path / "flight.jsonl"
-    assert str(log) in refused(capsys, "replay", log)
-    ended(start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--rate-hz", "60"))
-    assert "not recorded" in refused(capsys, "replay", log)
+    assert str(log) in expect_refusal(capsys, "replay", log)
+    finish_flight(start(recording / "cohog.gpkg", recording / "blind" / "images", log, "--rate-hz", "60"))
+    assert "not recorded" in expect_refusal(capsys, "replay", log)
     log.unlink()
     place_map = tmp_path / "m.gpkg"
     shutil.copy(recording / "cohog.gpkg", place_map)
-    ended(fly(*FAST_RATE, place_map=place_map))
+    finish_flight(fly(*FAST_RATE, place_map=place_map))
     place_map.rename(tmp_path / "elsewhere.gpkg")
-    assert "--map" in refused(capsys, "replay", log)
+    assert "--map" in expect_refusal(capsys, "replay", log)
     assert main(["replay", str(log), "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
     there = tmp_path / "there"
     there.mkdir()
@@ -170,6 +170,6 @@ def test_replay_reports_missing_files(fly, recording, tmp_path, capsys):
     assert "truncated" in capsys.readouterr().out
     (tape,) = (there / "recorded").glob(f"*/{TAPE}")
     tape.write_text(tape.read_text().replace('"mavlink": {', '"mavlink": {"ground": "udpout:10.0.0.2:14550", ', 1))
-    assert "second link" in refused(capsys, "replay", moved)
+    assert "second link" in expect_refusal(capsys, "replay", moved)
     shutil.rmtree(there / "recorded")
-    assert "neither at" in refused(capsys, "replay", moved)
+    assert "neither at" in expect_refusal(capsys, "replay", moved)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from flight_process import start
 from flights import select
-from ground_stations import mavproxy_with
+from ground_stations import start_mavproxy
 from loopback import free_port, wait_until
 from mavlink_peers import AutopilotThread, Peer, SerialCable, UdpPort
 
@@ -50,7 +50,7 @@ def mavlink_router(put, folder):
 @contextmanager
 def mavproxy(put, folder):
     _, *flags = shlex.split(put(read_code_block("MAVProxy owns it", "sh")))
-    with mavproxy_with(folder, *flags):
+    with start_mavproxy(folder, *flags):
         yield
 
 
@@ -87,30 +87,30 @@ def test_run_survives_a_router_killed_in_flight(recording, tmp_path, owner, sect
         stack.callback(flight.communicate)
         stack.callback(flight.send_signal, signal.SIGTERM)
 
-        def accepted():
+        def count_accepted():
             assert flight.poll() is None, flight.communicate()[1]
             answers = select(read_log(log), "answer") if log.exists() else []
             return sum(line["result"] == "ACCEPTED" for line in answers)
 
         station = Peer(station_port, system_id=255)
 
-        def hears(name, component_id, **fields):
+        def receives(name, component_id, **fields):
             message = station.expect(name)
             return message.get_srcComponent() == component_id and fields.items() <= message.to_dict().items()
 
-        def answers():
+        def is_answered():
             station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"EK3_ENABLE", -1), component_id=190)
-            return hears("PARAM_VALUE", 1, param_id="EK3_ENABLE")
+            return receives("PARAM_VALUE", 1, param_id="EK3_ENABLE")
 
         with owner(put, tmp_path):  # after the flight
-            wait_until(accepted, "a fix was taken")
+            wait_until(count_accepted, "a fix was taken")
             for name in ("HEARTBEAT", "STATUSTEXT", "NAMED_VALUE_FLOAT") if is_shown else ():
-                wait_until(lambda name=name: hears(name, EDGEVPR), f"{name} of the flight")
-            wait_until(lambda: hears("HEARTBEAT", 1), "HEARTBEAT of the autopilot")
-            wait_until(answers, "the autopilot's answer")
-        before = accepted()
+                wait_until(lambda name=name: receives(name, EDGEVPR), f"{name} of the flight")
+            wait_until(lambda: receives("HEARTBEAT", 1), "HEARTBEAT of the autopilot")
+            wait_until(is_answered, "the autopilot's answer")
+        before = count_accepted()
         with owner(put, tmp_path):
-            wait_until(lambda: accepted() > before, "a fix was taken again")
+            wait_until(lambda: count_accepted() > before, "a fix was taken again")
         flight.send_signal(signal.SIGTERM)
         assert flight.wait(timeout=60) == 0
         seen = pilot.finish()

@@ -6,7 +6,7 @@ import cv2
 import fake_rpicam
 import numpy as np
 import pytest
-from distorted_cameras import wide
+from distorted_cameras import make_wide_camera
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
@@ -69,7 +69,7 @@ def test_check_camera_finds_a_program_that_has_it_open(root):
 
 
 def test_check_frame_compares_the_frame_with_the_lens(tmp_path):
-    camera = wide()
+    camera = make_wide_camera()
     lens = str(camera.write(tmp_path / "lens.yaml"))
     folder = tmp_path / "images"
     folder.mkdir()

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from answering_autopilot import AnsweringAutopilot
 from loopback import free_port
-from pictures import textured, write_flight
+from pictures import draw_texture, write_flight
 from walks import make_map
 
 from edgevpr import techniques
@@ -30,7 +30,7 @@ ITEMS = ["configuration", "board", "map", "source", "link", "log"]
 def flight_folder(tmp_path_factory) -> Path:
     """A folder with a map of `hog` and the images it was made of."""
     folder = tmp_path_factory.mktemp("flight")
-    frames = [Frame(image=textured(seed), name=f"{seed}.png", t_mono_s=0.0) for seed in range(2)]
+    frames = [Frame(image=draw_texture(seed), name=f"{seed}.png", t_mono_s=0.0) for seed in range(2)]
     write_flight(folder / "images", [frame.image for frame in frames])
     make_map(folder / "valley.gpkg", techniques.create("hog"), frames)
     return folder
@@ -137,7 +137,7 @@ def test_check_reports_places_beyond_the_budget(settings, config_file):
     big = config_file.with_name("big.gpkg")
     shutil.copy(settings["map"], big)
     with PlaceMap.open_for_writing(big) as place_map:
-        frame, technique = Frame(image=textured(3), name="3.png", t_mono_s=0.0), techniques.create("hog")
+        frame, technique = Frame(image=draw_texture(3), name="3.png", t_mono_s=0.0), techniques.create("hog")
         descriptor = technique.encode(frame.image)
         while len(place_map) * technique.spec.coarse.nbytes < 1e6:
             place_map.add(frame, descriptor)

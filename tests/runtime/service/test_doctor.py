@@ -58,11 +58,11 @@ PX4 = replace(
 )
 
 
-def with_parameters(reading: AutopilotReading, **parameters) -> AutopilotReading:
+def set_parameters(reading: AutopilotReading, **parameters) -> AutopilotReading:
     return replace(reading, parameters=reading.parameters | parameters)
 
 
-def faults(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
+def find_faults(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
     """What is wrong, and the changes that it needs."""
     return {each.what: each.changes for each in check_autopilot(reading, link, plan) if not each.ok}
 
@@ -75,7 +75,7 @@ SIGNED = replace(MUTE, signs=True, signs_requests=True)
 
 
 def test_check_autopilot_accepts_a_configured_copter_and_px4():
-    assert faults(COPTER) == faults(PX4) == {}
+    assert find_faults(COPTER) == find_faults(PX4) == {}
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_check_autopilot_accepts_a_configured_copter_and_px4():
     ],
 )
 def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
-    assert faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)) == {}
+    assert find_faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters)) == {}
 
 
 @pytest.mark.parametrize("vehicle", ["copter", "rover", "vehicle"])
@@ -98,22 +98,22 @@ def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
     "parameters", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
 )
 def test_check_autopilot_requires_a_second_receiver_without_another_source(vehicle, parameters):
-    found = faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
+    found = find_faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
     assert found == {"channel": ("GPS2_TYPE=14",)}
-    assert faults(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
+    assert find_faults(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
 
 
 def test_check_autopilot_names_parameters_as_the_firmware_does():
-    assert faults(BARE) == {"channel": ("GPS2_TYPE=14",)}
-    assert faults(with_parameters(BARE, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert find_faults(BARE) == {"channel": ("GPS2_TYPE=14",)}
+    assert find_faults(set_parameters(BARE, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 0, "GPS_AUTO_SWITCH": 1})
-    assert faults(older) == {"channel": ("GPS_TYPE2=14",)}
-    assert faults(replace(older, parameters=older.parameters | {"GPS_TYPE": 14})) == {}
+    assert find_faults(older) == {"channel": ("GPS_TYPE2=14",)}
+    assert find_faults(replace(older, parameters=older.parameters | {"GPS_TYPE": 14})) == {}
 
 
 def test_check_autopilot_has_a_finding_for_each_broken_rule():
-    several = with_parameters(COPTER, GPS_AUTO_SWITCH=4, GPS_PRIMARY=1, EK3_SRC1_POSXY=6, AHRS_EKF_TYPE=2, EK3_ENABLE=0)
-    assert faults(several) == {
+    several = set_parameters(COPTER, GPS_AUTO_SWITCH=4, GPS_PRIMARY=1, EK3_SRC1_POSXY=6, AHRS_EKF_TYPE=2, EK3_ENABLE=0)
+    assert find_faults(several) == {
         "GPS_PRIMARY": ("GPS_PRIMARY=0",),
         "EK3_SRCn_POSXY": ("EK3_SRC1_POSXY=3",),
         "AHRS_EKF_TYPE": ("EK3_ENABLE=1", "AHRS_EKF_TYPE=3"),
@@ -122,10 +122,10 @@ def test_check_autopilot_has_a_finding_for_each_broken_rule():
 
 def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
     changes = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
-    assert faults(VISUAL) == {"EK3_SRCn_POSXY": changes}
-    prepared = with_parameters(VISUAL, EK3_SRC2_POSXY=6)
-    assert faults(prepared) == {}
-    assert set(faults(replace(prepared, origin=None))) == {"origin"}
+    assert find_faults(VISUAL) == {"EK3_SRCn_POSXY": changes}
+    prepared = set_parameters(VISUAL, EK3_SRC2_POSXY=6)
+    assert find_faults(prepared) == {}
+    assert set(find_faults(replace(prepared, origin=None))) == {"origin"}
 
 
 @pytest.mark.parametrize(
@@ -150,30 +150,32 @@ def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
     ],
 )
 def test_check_autopilot_finds_each_fault_alone(change, what, changes):
-    assert faults(replace(COPTER, **change)) == {what: changes}
+    assert find_faults(replace(COPTER, **change)) == {what: changes}
 
 
 def test_check_autopilot_accepts_unknown_values():
-    assert faults(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
+    assert find_faults(replace(COPTER, clock_ahead_s=None, round_trip_s=None, gps_fix=(0, 4))) == {}
 
 
 def test_check_autopilot_wants_a_faster_line():
-    assert faults(replace(COPTER, round_trip_s=0.4), SERIAL) == {"link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")}
+    assert find_faults(replace(COPTER, round_trip_s=0.4), SERIAL) == {
+        "link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")
+    }
     px4_changes = ("MAV_1_CONFIG=102", "MAV_1_MODE=2", "SER_TEL2_BAUD=921600")
-    assert faults(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
+    assert find_faults(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
 
 
 def test_check_autopilot_reports_only_the_link_without_an_answer():
-    assert set(faults(MUTE)) == set(faults(SIGNED)) == {"link"}
-    assert set(faults(replace(MUTE, signs=True))) == {"link", "signing"}
-    assert faults(replace(COPTER, signs=True)) == {}
+    assert set(find_faults(MUTE)) == set(find_faults(SIGNED)) == {"link"}
+    assert set(find_faults(replace(MUTE, signs=True))) == {"link", "signing"}
+    assert find_faults(replace(COPTER, signs=True)) == {}
 
 
 @pytest.mark.parametrize("vehicle", ["copter", "rover"])
 def test_check_autopilot_wants_no_second_receiver_for_a_dry_run(vehicle):
     bare = replace(COPTER, vehicle=vehicle, parameters=PLAIN | {"GPS_AUTO_SWITCH": 0})
-    assert faults(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
-    assert faults(bare, plan=DRY) == {}
+    assert find_faults(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert find_faults(bare, plan=DRY) == {}
 
 
 @pytest.mark.parametrize(
@@ -186,43 +188,45 @@ def test_check_autopilot_wants_no_second_receiver_for_a_dry_run(vehicle):
 )
 def test_check_autopilot_finds_parameters_that_prevent_arming_in_a_dry_run(parameters, change):
     ready = replace(COPTER, parameters=PLAIN | parameters)
-    assert faults(ready) == {}
-    assert faults(ready, plan=DRY) == {"channel": (change,)}
+    assert find_faults(ready) == {}
+    assert find_faults(ready, plan=DRY) == {"channel": (change,)}
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 14})
-    assert faults(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
+    assert find_faults(older, plan=DRY) == {"channel": ("GPS_TYPE2=0",)}
 
 
 def test_check_autopilot_accepts_a_constant_position_of_px4_alone():
-    assert faults(replace(PX4, filter_flags=0x3FF)) == {}, "as a real one says on the pad"
-    assert set(faults(replace(COPTER, filter_flags=0x3FF))) == {"filter"}
+    assert find_faults(replace(PX4, filter_flags=0x3FF)) == {}, "as a real one says on the pad"
+    assert set(find_faults(replace(COPTER, filter_flags=0x3FF))) == {"filter"}
 
 
 def test_check_autopilot_wants_px4_to_use_message_296():
-    bare = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
-    assert faults(bare) == {
+    bare = set_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
+    assert find_faults(bare) == {
         "channel": ("EKF2_AGP0_CTRL=1",),
         "EKF2_AGP0_DELAY": ("EKF2_AGP0_DELAY=0",),
         "EKF2_AGP0_ID": ("EKF2_AGP0_ID=1",),
     }
-    assert faults(with_parameters(PX4, EKF2_AGP0_CTRL=2)) == {"channel": ("EKF2_AGP0_CTRL=1",)}
+    assert find_faults(set_parameters(PX4, EKF2_AGP0_CTRL=2)) == {"channel": ("EKF2_AGP0_CTRL=1",)}
 
 
 def test_check_autopilot_wants_odometry_of_a_px4_without_message_296():
     without = replace(PX4, parameters={})
-    assert faults(without) == faults(with_parameters(without, EKF2_OF_CTRL=1)) == {"channel": ("EKF2_EV_CTRL=1",)}
-    (others,) = (each for each in check_autopilot(with_parameters(without, EKF2_EV_CTRL=15), UDP, FIXES) if not each.ok)
+    assert (
+        find_faults(without) == find_faults(set_parameters(without, EKF2_OF_CTRL=1)) == {"channel": ("EKF2_EV_CTRL=1",)}
+    )
+    (others,) = (each for each in check_autopilot(set_parameters(without, EKF2_EV_CTRL=15), UDP, FIXES) if not each.ok)
     assert (others.changes, others.reason.parameters["value"]) == (("EKF2_EV_CTRL=1",), 15)
-    assert faults(with_parameters(without, EKF2_EV_CTRL=1)) == {}
-    assert faults(with_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1)).keys() == {"EKF2_EV_NOISE_MD"}
-    assert faults(replace(without, vehicle="plane")) == {}
+    assert find_faults(set_parameters(without, EKF2_EV_CTRL=1)) == {}
+    assert find_faults(set_parameters(without, EKF2_EV_CTRL=1, EKF2_EV_NOISE_MD=1)).keys() == {"EKF2_EV_NOISE_MD"}
+    assert find_faults(replace(without, vehicle="plane")) == {}
 
 
 def test_check_autopilot_finds_an_old_px4():
-    assert faults(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
+    assert find_faults(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
         "firmware": ()
     }
-    assert set(faults(replace(PX4, version=None))) == {"firmware"}
-    assert faults(replace(PX4, sends_mavlink1=True)) == {"port": ("MAV_PROTO_VER=2",)}
+    assert set(find_faults(replace(PX4, version=None))) == {"firmware"}
+    assert find_faults(replace(PX4, sends_mavlink1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
 @pytest.mark.parametrize(
@@ -245,15 +249,18 @@ def test_explain_silence_names_the_cause(link, bad_bytes, others, refused, code,
 def test_doctor_changes_are_on_the_how_to_pages():
     docs = Path(__file__).parents[3] / "docs/how-to"
     copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
-    bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
-    for parameter, value in (change.split("=") for change in faults(bare)["channel"]):
+    bare = set_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
+    for parameter, value in (change.split("=") for change in find_faults(bare)["channel"]):
         assert re.search(rf"`{parameter}`.*\| {value} \|", copter)
-    for change in (*faults(VISUAL)["EK3_SRCn_POSXY"], "VISO_TYPE=1"):
+    for change in (*find_faults(VISUAL)["EK3_SRCn_POSXY"], "VISO_TYPE=1"):
         assert f"`{change}`" in copter
     assert "EK3_SRC2_VELXY=6" not in copter
-    unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
+    unset = set_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
     changes = [
-        change for each in (unset, replace(PX4, parameters={})) for found in faults(each).values() for change in found
+        change
+        for each in (unset, replace(PX4, parameters={}))
+        for found in find_faults(each).values()
+        for change in found
     ]
     for parameter, value in (change.split("=") for change in (*changes, *RULES["px4"].port_changes(921_600))):
         assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)

@@ -6,7 +6,7 @@ import time
 
 import psutil
 import pytest
-from flight_process import cpu_s, ended, manager, simulated_autopilot, start, wait_for
+from flight_process import finish_flight, open_notify_socket, read_cpu_s, serve_autopilot, start, wait_for
 from flights import PLACES, STEP_DEG, select
 
 from edgevpr.cli.main import main
@@ -21,16 +21,16 @@ pytestmark = pytest.mark.process
 def fly(recording, tmp_path):
     """Start a flight over the map's own pictures; its log is `tmp_path`/flight.jsonl unless another is named."""
 
-    def started(*flags, log=tmp_path / "flight.jsonl", **environment):
+    def start_flight(*flags, log=tmp_path / "flight.jsonl", **environment):
         return start(recording / "cohog.gpkg", recording / "blind" / "images", log, *flags, **environment)
 
-    return started
+    return start_flight
 
 
 def test_run_sends_what_it_logs(fly, tmp_path):
-    with simulated_autopilot() as (link, asked):
+    with serve_autopilot() as (link, asked):
         run = fly("--link", link, "--rate-hz", "3")  # ten seconds: a vehicle must have been heard before the first fix
-        said = ended(run)
+        said = finish_flight(run)
         seen = asked()
     lines = list(read_log(tmp_path / "flight.jsonl"))
     queries, end = select(lines, "query"), lines[-1]
@@ -63,8 +63,8 @@ WITHHELD = {"DRY_RUN", "NO_TELEMETRY"}  # the second for five seconds
 
 
 def test_dry_run_sends_everything_but_fixes(fly, tmp_path):
-    with simulated_autopilot() as (link, asked):
-        said = ended(fly("--link", link, "--rate-hz", "20", "--dry-run"))
+    with serve_autopilot() as (link, asked):
+        said = finish_flight(fly("--link", link, "--rate-hz", "20", "--dry-run"))
         seen = asked()
     assert "COMMAND_INT" not in seen.messages
     for name in ("HEARTBEAT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT", "ONBOARD_COMPUTER_STATUS"):
@@ -97,12 +97,12 @@ def test_run_ends_by_a_signal_with_a_complete_log(fly, tmp_path, number):
 def test_run_ends_by_a_signal_before_the_flight(recording, tmp_path, monkeypatch, caplog):
     """A large map takes its time on a slow board."""
 
-    def computing(*_, **__):
+    def compute_forever(*_, **__):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(60)
         pytest.fail("it went on computing")
 
-    monkeypatch.setattr(startup, "open_recogniser", computing)
+    monkeypatch.setattr(startup, "open_recogniser", compute_forever)
     place_map, images, log = recording / "cohog.gpkg", recording / "seen" / "images", tmp_path / "f.jsonl"
     with caplog.at_level("INFO"):
         assert main(["run", "--map", str(place_map), "--source", str(images), "--log", str(log)]) == 0
@@ -115,22 +115,22 @@ def test_run_breaks_off_a_long_query(recording, tmp_path):
     place_map, images, log = tmp_path / "slow.gpkg", recording / "blind" / "images", tmp_path / "flight.jsonl"
     built = ["map", "build", place_map, "--images", images, "--technique", "cohog", "--param", "w1=1200"]
     assert main([*map(str, built), "--no-calibrate"]) == 0
-    with manager(tmp_path) as (listening, environment):
+    with open_notify_socket(tmp_path) as (listening, environment):
         run = start(place_map, images, log, "--matching", "thesis", **environment)
         while b"READY=1" not in listening.recv(4096):
             pass
-        busy_s = cpu_s(run.pid)
-        while cpu_s(run.pid) < busy_s + 0.5:  # more than reading and encoding take
+        busy_s = read_cpu_s(run.pid)
+        while read_cpu_s(run.pid) < busy_s + 0.5:  # more than reading and encoding take
             assert run.poll() is None
             time.sleep(0.02)
         run.terminate()
-        ended(run)
+        finish_flight(run)
     lines = list(read_log(log))
     assert [line["kind"] for line in lines] == ["start", "end"], "what is broken off is no query"
 
 
 def test_run_notifies_systemd(fly, tmp_path):
-    with manager(tmp_path) as (listening, environment):
+    with open_notify_socket(tmp_path) as (listening, environment):
         run = fly("--rate-hz", "20", **environment)
         said = []
         while "STOPPING=1" not in said:
@@ -144,17 +144,17 @@ def test_run_notifies_systemd(fly, tmp_path):
 def test_run_puts_a_relative_log_into_the_folder_of_logs(fly, tmp_path):
     (tmp_path / "logs").mkdir()
     run = fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs"))
-    ended(run)
+    finish_flight(run)
     assert list(read_log(tmp_path / "logs" / "own.jsonl"))[-1]["kind"] == "end"
 
 
 def test_service_runs_without_a_writable_status_and_opens_no_port(fly, tmp_path):
     config, status = tmp_path / "c.yaml", tmp_path / "nowhere" / "s"
     config.write_text(f"status: {{file: {status}}}\n")
-    assert str(status) in ended(fly("--config", config), code=1)
+    assert str(status) in finish_flight(fly("--config", config), code=1)
     log = tmp_path / "2.jsonl"
     service = fly("--config", config, "--rate-hz", "2", log=log, NOTIFY_SOCKET=str(tmp_path / "nobody"))
     wait_for("query", log, service)
     assert {each.status for each in psutil.Process(service.pid).net_connections("inet")} <= {psutil.CONN_NONE}
     service.terminate()
-    ended(service)
+    finish_flight(service)

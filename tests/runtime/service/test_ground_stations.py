@@ -6,7 +6,7 @@ from contextlib import ExitStack, suppress
 
 import pytest
 from flight_process import start
-from ground_stations import mavsdk_example
+from ground_stations import start_mavsdk_example
 from loopback import free_port
 from mavlink_peers import AutopilotThread, UdpPort
 
@@ -20,7 +20,7 @@ def route(stack: ExitStack, station: int) -> tuple[int, int]:
     for end in (*ends, copy):
         stack.callback(end.close)
 
-    def pass_on(source: UdpPort, target: UdpPort) -> None:
+    def forward_packets(source: UdpPort, target: UdpPort) -> None:
         with suppress(OSError):  # closed at the end
             while data := source.recv(65_536):
                 copy.send(data)
@@ -28,14 +28,14 @@ def route(stack: ExitStack, station: int) -> tuple[int, int]:
                     target.send(data)
 
     for pair in (ends, ends[::-1]):
-        threading.Thread(target=pass_on, args=pair, daemon=True).start()
+        threading.Thread(target=forward_packets, args=pair, daemon=True).start()
     return ends[0].number, ends[1].number
 
 
 def test_mavsdk_example_reports_whether_the_place_is_recognised(recording, tmp_path):
     ground = free_port()
     with ExitStack() as stack:
-        station = stack.enter_context(mavsdk_example(ground, tmp_path))
+        station = stack.enter_context(start_mavsdk_example(ground, tmp_path))
         autopilot, companion = route(stack, ground)
         pilot = AutopilotThread(f"udpout:127.0.0.1:{autopilot}")
         stack.callback(pilot.finish)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from flight_process import manager, start
+from flight_process import open_notify_socket, start
 from flights import select
 from loopback import PATIENCE_S, wait_until
 
@@ -28,7 +28,7 @@ def start_hanging_flight(recording, tmp_path):
     """Start a flight whose camera hangs in a step; returns it once it hangs."""
     flights = []
 
-    def started(step, **environment):
+    def start_flight(step, **environment):
         (tmp_path / "c.yaml").write_text(f"status: {{file: {tmp_path / 'status.json'}}}\n")
         run = ["run", "--map", recording / "cohog.gpkg", "--source", "/dev/video0", "--log", tmp_path / "f.jsonl"]
         flags = ["--rate-hz", "5", "--config", tmp_path / "c.yaml"]
@@ -40,7 +40,7 @@ def start_hanging_flight(recording, tmp_path):
         wait_until((tmp_path / "mark").exists)
         return flight
 
-    yield started
+    yield start_flight
     for each in flights:
         each.kill()
         each.wait()
@@ -64,7 +64,7 @@ def test_run_reports_a_hanging_camera_and_ends(start_hanging_flight, step, state
 
 
 def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(start_hanging_flight, tmp_path):
-    with manager(tmp_path) as (listening, environment):
+    with open_notify_socket(tmp_path) as (listening, environment):
         flight = start_hanging_flight("main", **environment)
         listening.settimeout(2.0)
         give_up_s = time.monotonic() + PATIENCE_S

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from pictures import textured, write_flight
+from pictures import draw_texture, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
@@ -13,7 +13,7 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 
 def draw_display(place, figures):
     """The picture of a place behind a display: two panels of figures."""
-    picture = textured(place, 240, 320)
+    picture = draw_texture(place, 240, 320)
     picture[:60], picture[190:] = 0, 0
     for row in (25, 50, 215, 235):
         cv2.putText(picture, figures, (3, row), cv2.FONT_HERSHEY_PLAIN, 1.1, 255, 1)

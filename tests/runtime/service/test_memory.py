@@ -6,7 +6,7 @@ import tracemalloc
 
 import pytest
 from big_map import file_bytes, make_big_map
-from flight_process import ended, start, watch_memory, write_frames
+from flight_process import finish_flight, start, watch_memory, write_frames
 
 from edgevpr.places.index import compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -50,7 +50,7 @@ def flight(big_map):
         through=["prlimit", f"--as={LIMIT_BYTES}", "taskset", "--cpu-list", two_cores],
     )  # fmt: skip
     largest, mapped = watch_memory(process)
-    ended(process)
+    finish_flight(process)
     return list(read_log(log)), largest, mapped
 
 
