@@ -1,5 +1,4 @@
-"""Log files that grow in flight: each write is complete or undone, and a full file is renamed. All functions raise
-OSError.
+"""Log files that grow in flight: each write is complete or undone, and a full file is renamed. All may raise OSError.
 
 Renamed files are called NAME-0001.jsonl, NAME-0002.jsonl, ... in the folder of NAME.jsonl ("numbered files" below). A
 new number is one above the highest, so numbers give the order even if the aircraft's clock is wrong. Symbolic links are

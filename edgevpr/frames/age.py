@@ -68,9 +68,8 @@ class StampedTime:
     """Estimates when pictures were taken, from the stream's timestamps, whose epoch is unknown.
 
     The delay of a picture is its arrival time minus its stamp. Its age is the excess over the smallest delay so far,
-    the minimum. A larger value replaces the minimum only after delays have been steady for five seconds, as after a
-    pause of the sender; in a congested network they vary. `is_live`: all pictures buffered before the stream was opened
-    have been fetched.
+    the minimum. A larger one replaces it only after five seconds of steady delays, as after a pause of the sender; in a
+    congested network they vary. `is_live`: all pictures buffered before the opening have been fetched.
 
     The delay grows if a camera delivers fewer pictures than its stamps claim, or if a link carries less than is sent.
     On a saturated link, large pictures take longer than small ones, and pictures become older. A slow camera sends all

@@ -49,8 +49,7 @@ def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
 
 
 def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
-    """Request `uri`; return None if that fails for a reason that FFmpeg will report itself. Raises OpeningError on
-    timeout."""
+    """Request `uri`; return None if that fails for a reason that FFmpeg will report. Raises OpeningError on timeout."""
     try:
         return send_request(uri, timeout_s)
     except _REQUEST_ERRORS as error:

@@ -107,8 +107,7 @@ def suggest_lens(pictures: FlightPictures, config: SourceConfig, technique: Tech
 
 @show_elapsed("checking where the camera points")
 def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -> None:
-    """Log that the camera is assumed to face forward, and why. Raises UsageError if it clearly looks straight down; the
-    user must then choose."""
+    """Log that the camera is assumed to face forward, and why. Raises UsageError if it clearly looks straight down."""
     tilt_deg = _read_gimbal_tilt_deg(pictures.folder) if pictures.folder else None
     if tilt_deg is not None and not _MAX_DOWN_DEG < tilt_deg < _MIN_FORWARD_DEG:
         is_down, why = tilt_deg <= _MAX_DOWN_DEG, f"XMP data: tilted {tilt_deg:.0f} degrees from straight down"

@@ -3,9 +3,8 @@ recorded positions and the ties. A tie is the relative pose of two pictures that
 
 A place has two complex unknowns. Its position p is east + i north, in metres. Its *log* l is a complex logarithm of
 footprint and direction: exp(l) = footprint_m exp(-i up), a factor that converts an offset in the picture (right + i up,
-as fractions of its longest side) to one on the ground. In a tie, `step` is the offset of the centre of picture `query`
-from the centre of picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale from `place` to
-`query`:
+in its longest sides) to one on the ground. In a tie, `step` is the offset of the centre of picture `query` from the
+centre of picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale from `place` to `query`:
 
     (p_query - p_place) exp(-l_place) = step        l_query - l_place = turn
 

@@ -160,10 +160,9 @@ class FoundLookAlike:
 def find_look_alikes(
     place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Mask | None]]
 ) -> Iterator[FoundLookAlike | None]:
-    """Search the places elsewhere for each of the `pictures` (place id, its picture as encoded, the picture's mask),
-    and yield the place that looks like it (None: no such place). Skipped are places without a position, and pictures
-    from which their place was not made; nothing is yielded for a technique without a confidence. Raises MapError if the
-    map cannot be read."""
+    """Search the places elsewhere for each of the `pictures` (place id, encoded picture, its mask), and yield the place
+    that looks like it (None: no such place). Skipped are places without a position, and pictures from which their place
+    was not made; nothing is yielded for a technique without a confidence. Raises MapError if the map cannot be read."""
     technique = create_technique(place_map)
     if not list_evidence_kinds(technique.spec):
         return

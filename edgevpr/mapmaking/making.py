@@ -42,8 +42,7 @@ class MapPlan:
     """The map to make at `path` from `pictures`.
 
     `technique`: its name (None: that of the existing map, or else `cohog`). `parameters`: technique parameters by name.
-    `append`: add places to the map if it exists. `refine`, `calibrate`: also refine and calibrate the map after
-    its places have been made."""
+    `append`: add places to the map if it exists. `refine`, `calibrate`: then also refine and calibrate it."""
 
     path: str
     pictures: FlightPictures | OrthophotoGrid

@@ -27,8 +27,7 @@ SelectedFrame = tuple[EncodedFrame, Salience | None]  # a frame that becomes a p
 
 
 class PlaceSelector:
-    """Selects the frames that become places, without long gaps (see the module's docstring). `max_gap_m` None:
-    distances are ignored."""
+    """Selects the frames that become places, without long gaps (see above). `max_gap_m` None: distances are ignored."""
 
     def __init__(self, max_frames: int = GAP_FRAMES, max_gap_m: float | None = None) -> None:
         self._max_frames, self._max_gap_m = max_frames, max_gap_m

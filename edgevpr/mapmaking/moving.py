@@ -37,8 +37,7 @@ class MapMove:
 
 def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
     """Move all places of a map that is open for writing, in one transaction, by the last survey result in a flight log.
-    Raises UsageError if the log has no result, or is from another map or another version of this one. Raises MapError
-    as `PlaceMap` does."""
+    Raises UsageError if the log has no result, or is from another map or version, and MapError as `PlaceMap` does."""
     survey, identity = None, None
     for line in select_last_flight(log):
         if line["kind"] == "start":

@@ -2,8 +2,7 @@
 positions. `mapmaking.finishing` calls it.
 
 Each place gets a pose: the direction and footprint of its picture, and a position with a covariance. Headings, lens and
-mounting of the camera need not be known. A place connected by ties (see `graph`) to too few others keeps its recorded
-position and gets no pose.
+mounting need not be known. A place tied (see `graph`) to too few others keeps its recorded position and gets no pose.
 
 Only pairs that may overlap are compared: places recorded near each other, and, because a recorded position may be far
 off, places mapped one after the other. After the pose graph is solved, pairs that overlap in the solution are compared
@@ -63,9 +62,8 @@ _CACHED_DESCRIPTORS = 4
 
 class Tie(NamedTuple):
     """Relative pose of two pictures, `query` to `place`. `step`: complex offset from the centre of the place's picture
-    to the centre of the query's (right + i up, as fractions of the longest side of the place's picture). `turn`:
-    complex, log(scale) + i counter-clockwise rotation in radians. `step_sd`, `turn_sd`: standard deviations of `step`
-    and `turn` along one axis."""
+    to the centre of the query's (right + i up, in longest sides of the place's picture). `turn`: complex, log(scale) +
+    i counter-clockwise rotation in radians. `step_sd`, `turn_sd`: standard deviations of both along one axis."""
 
     step: complex
     turn: complex

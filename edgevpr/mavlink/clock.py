@@ -1,6 +1,5 @@
 """The autopilot's clock (seconds since its boot) as a function of our monotonic clock. It is synchronised by TIMESYNC
-(ArduPilot `GCS_MAVLINK::handle_timesync`, PX4 `MavlinkTimesync::handle_message`), and also detects restarts of the
-autopilot."""
+(ArduPilot `GCS_MAVLINK::handle_timesync`, PX4 `MavlinkTimesync::handle_message`), and detects its restarts."""
 
 import logging
 import math

@@ -1,5 +1,4 @@
-"""Position fixes in transit to the autopilot: queued ones, and those that await an answer. Used by `conversation`
-only inside turns.
+"""Position fixes in transit to the autopilot: queued, or awaiting an answer. Used by `conversation` only inside turns.
 
 A fix is never sent late, and after five consecutive unanswered fixes only occasional ones are sent. COMMAND_ACK does
 not identify the fix that it answers, so it is matched to the oldest fix sent less than a second ago. With one fix a
@@ -67,9 +66,8 @@ class FixTransmission:
 
 
 class Fixes:
-    """The fixes of one link: queued ones, and those that await an answer. Counts fixes `dropped` (too old or too many),
-    `withheld` (by `find_objection` or a pause) and `unanswered`. `refusal`: reason of the autopilot's last refusal
-    (None: no refusal)."""
+    """The fixes of one link, queued or awaiting an answer. Counts fixes `dropped` (too old or too many), `withheld` (by
+    `find_objection` or a pause) and `unanswered`. `refusal`: reason of the last refusal (None: none)."""
 
     def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda *_: None) -> None:
         self._announce = announce

@@ -31,8 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 class Altitudes(NamedTuple):
-    """Altitudes reported at time `t_s` in metres, above sea level (None: the autopilot has no position) and above home,
-    and the climb rate."""
+    """Altitudes at time `t_s` in metres above sea level (None: without a position) and home, and the climb rate."""
 
     t_s: float
     above_sea_m: float | None

@@ -131,9 +131,8 @@ def make_position_sensor(state: MotionState) -> Message:
 
 
 def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
-    """Make a GPS_INPUT (232) for GPS receiver `receiver` (0: the first). A `state` of None is sent as "no fix", a
-    fallback (`is_fallback`) as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970
-    (None: unknown)."""
+    """Make a GPS_INPUT (232) for the `receiver` (0: the first). A `state` of None is sent as "no fix", a fallback
+    (`is_fallback`) as a poor fix. `stamp_s`: time of the state. `t_unix_s`: in seconds since 1970 (None: unknown)."""
     week, time_of_week_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
     satellites, sd_m, sd_m_s = 0, 0.0, 0.0

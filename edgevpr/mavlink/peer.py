@@ -49,9 +49,8 @@ class Endpoint(NamedTuple):
 
 class Identity:
     """Decides which sender is our autopilot, `current`: the first one or, if `system_id` is set, the first with that
-    id. A sender with another system id never replaces it. A sender with the same system id at another address replaces
-    it once it has been silent for 30 s; then it `has_moved`. `foreign_messages` counts the messages of other
-    senders."""
+    id. A sender with another system id never replaces it. One with the same id at another address replaces it once it
+    has been silent for 30 s; then it `has_moved`. `foreign_messages` counts those of other senders."""
 
     def __init__(self, system_id: int | None = None) -> None:
         self.current: Endpoint | None = None

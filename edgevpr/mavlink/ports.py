@@ -212,9 +212,8 @@ def open_port(address: LinkAddress) -> Port:
 
 class PacketWriter:
     """Writes packets to a port, one at a time. A fix counts as sent when all its bytes have left the operating system
-    (over TCP: when they are acknowledged). If that has not happened by its `due_s`, `take_sent_fixes` raises
-    ConnectionError, and closing the port then discards the bytes. `unsent`: the bytes of the last packet that the port
-    has not yet accepted."""
+    (over TCP: when they are acknowledged). If not by its `due_s`, `take_sent_fixes` raises ConnectionError, and closing
+    the port then discards the bytes. `unsent`: the bytes of the last packet not yet accepted."""
 
     def __init__(self, port: Port, clock: Callable[[], float]) -> None:
         self.port, self._clock = port, clock

@@ -34,8 +34,7 @@ _DELAY_CONSEQUENCE = "We send the current position, which would be treated as an
 
 
 def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
-    """Choose the channel for PX4: message 296 or ODOMETRY if AGP_CONTROL or VISION_CONTROL enables it, else command
-    43003."""
+    """Choose PX4's channel: message 296 or ODOMETRY if AGP_CONTROL or VISION_CONTROL enables it, else command 43003."""
     fuses_ours = has_bit(parameters.get(AGP_CONTROL, 0), POSITION_BIT)
     if parameters.get(VISION_CONTROL) == POSITION_BIT and not fuses_ours:
         reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION_CONTROL, "source_set": None})

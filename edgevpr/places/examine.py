@@ -25,9 +25,8 @@ _LOW_QUALITY_FACTOR = 0.5  # applied to the value of a place that was added only
 
 
 class PlaceCheck(NamedTuple):
-    """The result of checking one place. `problem` describes the damage in a few words (None: no damage). `content` has
-    the values of its row by column name, without damaged landmarks (empty: unreadable). `is_usable`: nothing but its
-    landmarks is damaged."""
+    """Result of checking one place. `problem`: the damage in a few words (None: none). `content`: the values of its row
+    by column name, without damaged landmarks (empty: unreadable). `is_usable`: nothing but its landmarks is damaged."""
 
     place_id: int
     problem: str | None
@@ -109,9 +108,8 @@ def merge_maps(
     calibrated; `out` never is.
 
     A place is a duplicate if its image name and time are equal and its coarse part nearly equal to those of another
-    (`PlaceMap.has_descriptor`). Mask hash and lens are copied if they are the same in all maps; all attributions are
-    copied. Raises MapError if the techniques differ or a file cannot be read or written, and PlaceError if a place is
-    damaged."""
+    (`PlaceMap.has_descriptor`). Mask hash and lens are copied if the same in all maps, attributions always. Raises
+    MapError if the techniques differ or a file cannot be read or written, and PlaceError if a place is damaged."""
     with ExitStack() as stack:
         temp_path = stack.enter_context(mapfiles.write_atomically(out))
         maps = [stack.enter_context(PlaceMap.open(path)) for path in paths]
@@ -170,9 +168,8 @@ def check_map(path: str | Path, progress: Progress = iterate_silently) -> MapChe
 
 def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
     """Replace the map by a copy of its usable places, which keep their ids and get checksums; keep the original as
-    `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError and
-    leaves the map unchanged if no place can be read, if the original of an earlier repair exists, or if the copy cannot
-    be written."""
+    `*.damaged` and return its path. Mask hash and calibration are copied if readable. Raises MapError and leaves the
+    map unchanged if no place can be read, if an earlier original exists, or if the copy cannot be written."""
     path = mapfiles.require_map_file(path)
     original = path.with_name(path.name + ".damaged")
     if original.exists():

@@ -66,15 +66,13 @@ class PlaceIndex:
         return replace(self, **{name: array[slots] for name, array in self.arrays.items()})
 
     def spacing_m(self) -> float | None:
-        """Return the median distance in metres between successive places; None if no two successive places have
-        positions."""
+        """Return the median distance in metres between successive places; None if no two in a row have positions."""
         steps_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
         steps_m = steps_m[~np.isnan(steps_m)]
         return float(np.median(steps_m)) if len(steps_m) else None
 
     def find_within(self, position: Position, radius_m: float) -> Bools:
-        """Return bool (N,), True for each place within `radius_m` metres of `position`; False for those without a
-        position."""
+        """Return bool (N,), True for each place within `radius_m` metres of `position`; False if it has no position."""
         return distance_m(position.lat_deg, position.lon_deg, self.lat_deg, self.lon_deg) <= radius_m
 
 

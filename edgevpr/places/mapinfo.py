@@ -67,10 +67,9 @@ class MapInfo:
 
 @dataclass(frozen=True, slots=True)
 class MapIdentity:
-    """Identity of a map: equal for all copies of its file, different as soon as one place differs. `map_id` is the
-    random id assigned at its creation (None: the file has none). `places` is the number of places. `sha256` covers all
-    places (positions, poses, picture names, checksums of larger values) and the table edgevpr_map with the
-    calibration."""
+    """Identity of a map: equal for all copies of its file, different as soon as one place differs. `map_id`: random id
+    from its creation (None: the file has none). `places`: their number. `sha256` covers all places (positions, poses,
+    picture names, checksums of larger values) and the table edgevpr_map with the calibration."""
 
     map_id: str | None
     places: int

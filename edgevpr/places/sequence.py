@@ -28,8 +28,7 @@ _MAX_BETTER_FRACTION = 0.1
 
 
 def make_sequence_search(length: int) -> "SequenceSearch | None":
-    """Make the search over sequences of `length` queries. Returns None for a length of 1: each query is matched
-    alone."""
+    """Make the search over sequences of `length` queries; None for a length of 1: each query is matched alone."""
     return SequenceSearch(length) if length > 1 else None
 
 
@@ -43,8 +42,7 @@ class SequenceSearch:
 
     Call `add_query` for each query. No place may be accepted before `frames`, the number of queries, is `length`.
     `rivals` float32 (N,) has, for each place, the best mean score of a trajectory that ends there at a speed outside
-    0.8 to 1.2. A pause of more than five seconds, and more than three times the previous interval, starts a new
-    sequence."""
+    0.8 to 1.2. A pause of over five seconds, and over three times the previous interval, starts a new sequence."""
 
     def __init__(self, length: int) -> None:
         self.length = length

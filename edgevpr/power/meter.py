@@ -165,8 +165,7 @@ class ProcessLoad:
         return self._clock() - self._measured_s
 
     def add_work(self, work: StageCost) -> None:
-        """Add a piece of work. Its `cpu_s` is the CPU time of the one thread (`time.thread_time`) that did it or waited
-        for it."""
+        """Add work. Its `cpu_s` is the CPU time of the one thread (`time.thread_time`) that did it or waited for it."""
         self._work_s += work.wall_s
         self._work_cpu_s += work.cpu_s
 

@@ -22,9 +22,8 @@ _SOFT_LIMIT_BIT = 8
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThermalState:
     """State at one reading. `temperature_c`: of the hottest CPU sensor. `frequency_mhz`: of the fastest core cluster.
-    `throttled`: True if the machine is throttling now. `why`: signs that it is or was, as text ("": none).
-    `under_voltage`: the supply voltage is too low, or was since the last reading. `hot`: throttling temperature
-    reached. None: unknown."""
+    `throttled`: the machine throttles now. `why`: signs that it does or did ("": none). `under_voltage`: the supply
+    voltage is too low, or was since the last reading. `hot`: throttling temperature reached. None: unknown."""
 
     temperature_c: float | None
     frequency_mhz: float | None

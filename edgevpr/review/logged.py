@@ -1,5 +1,4 @@
-"""Reads a flight log into checked values for the report. A field that is missing, damaged or of the wrong type becomes
-None."""
+"""Reads a flight log into checked values for the report. A missing, damaged or wrongly typed field becomes None."""
 
 import logging
 from dataclasses import dataclass, field

@@ -49,9 +49,8 @@ def make_map_page(
     lens: "Lens | None",
 ) -> str:
     """Return the complete page for the map `name`. `lines`: the output of `map info`. `mean_confidences`: of the
-    correct matches of each place that calibration queried, by place number. `look_alikes`: for each place whose
-    picture was searched, the place that looks alike (None: none does). `pictures`: the map's album. `lens`: lens of
-    its camera (None: unknown)."""
+    correct matches of each place that calibration queried, by place number. `look_alikes`: for each place searched, the
+    one that looks alike (None: none). `pictures`: the map's album. `lens`: lens of its camera (None: unknown)."""
     ground = [place for place in places if place.position]
     points = {place.place_id: to_point(place) for place in ground}
     tags_off_m, twins = measure_inconsistent_tags(ground), {twin.place_id: twin for twin in look_alikes if twin}

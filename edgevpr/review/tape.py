@@ -138,8 +138,7 @@ class ReplayedSource(Source):
 
 class Playback(Tape):
     """Plays back a tape. `perform_turn` performs a turn of the link, given its time and steps (None: the link has not
-    started); turns are performed in the order of the tape. `packets` compares the packets sent with those of the
-    flight.
+    started); turns keep the order of the tape. `packets` compares the packets sent with those of the flight.
 
     Code that has changed since the flight may read more, less, or in another order. A read that has no value on the
     tape before the next frame returns the newest value of its kind, which keeps code and tape synchronised. `guessed`

@@ -99,8 +99,7 @@ class Section:
 
 
 def read_located_places(path: str | Path) -> list[Place]:
-    """Read the places with a position from the map file `path`. Raises EdgevprError for a map that is unreadable or
-    damaged."""
+    """Read the places with a position from the map file `path`. Raises EdgevprError if it is unreadable or damaged."""
     with PlaceMap.open(path) as place_map:
         return [place for place in place_map.read_places() if place.position]
 

@@ -54,14 +54,12 @@ from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, com
 
 @dataclass(eq=False, kw_only=True)
 class CoHog:
-    """The technique CoHOG. `w1`: side of the scaled image in pixels (W1 = H1 of the thesis). `w2`: side of a cell in
-    pixels (W2 = H2). `bins`: orientations (L). `gt`: minimum entropy of a good block, 0 to 1 (GT; below 0: the default
-    for `entropy`). `entropy`: "shannon" or "filled_bins". `matching`: "displacement" or "thesis", see above; the map
-    does not record it.
+    """The technique CoHOG. `w1`: side of the scaled image in pixels (W1 = H1 of the thesis). `w2`: that of a cell (W2 =
+    H2). `bins`: orientations (L). `gt`: minimum entropy of a good block, 0 to 1 (GT; below 0: the default for
+    `entropy`). `entropy`: "shannon" or "filled_bins". `matching`: "displacement" or "thesis", not recorded in the map.
 
-    With `camera` "nadir" the image is padded to a square, not stretched, so that a rotated image shows the same
-    ground. A query is compared under several hypotheses: five heights (one if `matching` is "thesis") with 24 rotations
-    each (see `views`)."""
+    With `camera` "nadir" the image is padded to a square, not stretched, so a rotated image shows the same ground. A
+    query has several hypotheses: five heights (one if `matching` is "thesis") with 24 rotations each (`views`)."""
 
     w1: int = 512
     w2: int = 16

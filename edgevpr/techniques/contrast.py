@@ -71,8 +71,7 @@ def _find_range(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
 
 
 def _average_blocks(levels: Array) -> Array:
-    """Average integers, uint8 (side, side), over square blocks: float32 (n, n). Sums of integers are exact in any
-    order."""
+    """Average uint8 (side, side) over square blocks: float32 (n, n). Sums of integers are exact in any order."""
     block_px = max(1, len(levels) // _BLOCKS_PER_SIDE)
     n = len(levels) // block_px
     cropped = levels[: n * block_px, : n * block_px].astype(np.float32)

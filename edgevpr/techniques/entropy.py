@@ -126,8 +126,7 @@ def _compute_shannon_map(small: Array) -> Singles:
 
 
 def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_compute_shannon_map` only at the P True pixels of bool (H, W), each from its own histogram: float32
-    (P,)."""
+    """Compute `_compute_shannon_map` only at the P True pixels of bool (H, W), each by its histogram: float32 (P,)."""
     r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside the image
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)

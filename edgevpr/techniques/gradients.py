@@ -118,14 +118,12 @@ def _sum_angles(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> 
 
 
 def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
-    """Compute the sums of `_sum_angles` for 8 orientations over 360 degrees, without angles, branches or
-    scattered sums.
+    """Compute the sums of `_sum_angles` for 8 orientations over 360 degrees, without angles, branches or scattering.
 
     A gradient of magnitude m is in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
     |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g < 0. With v = sqrt(2) m
     sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is summed over the cells
-    once unchanged, and once multiplied by the sign of dx, dy or both. The orientations are sums and differences of
-    these."""
+    unchanged, and multiplied by the sign of dx, dy or both. The orientations are sums and differences of these."""
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)
@@ -175,9 +173,8 @@ def _compute_magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[
 
 
 def normalise_blocks(cells: Singles) -> Singles:
-    """Return the blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3): float32
-    (rows, cols, L) to (rows-1, cols-1, 4L) in the order top left, top right, bottom left, bottom right. A block without
-    any gradient is all zeros."""
+    """Return blocks of 2x2 cells, stride one cell, of Euclidean length 1 (thesis 6.2.2, step 3): float32 (rows, cols,
+    L) to (rows-1, cols-1, 4L): top left, top right, bottom left, bottom right. A block without gradient is zero."""
     blocks = np.concatenate([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=2)
     length = np.sqrt(np.add.reduce(blocks * blocks, axis=2))
     blocks /= np.maximum(length, 1e-6)[:, :, None]

@@ -60,9 +60,8 @@ _BYTE_VALUES = np.stack(np.divmod(np.arange(256), 16)[::-1], axis=1).astype(np.f
 
 def make_field(grid: Grid, patterns: Array, indices: Ints, sides: tuple[int, int]) -> Array:
     """Average the patterns of good regions in the cells of a grid. `patterns` (G, 20) belong to the regions `indices`,
-    int (G,), row-major in `sides[0]` x `sides[0]` regions. A place has `sides[1]` along a side, and the same centre.
-    Returns the field (C, m, m) of C channels; m is `grid.side` or, for a picture that shows more ground, larger by an
-    even number."""
+    int (G,), row-major in `sides[0]` x `sides[0]` regions. A place has `sides[1]` a side, and the same centre. Returns
+    the field (C, m, m) of C channels; m is `grid.side` or, for a picture of more ground, larger by an even number."""
     side, place_side = sides
     padded = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
     padded[indices, :-1] = patterns[:, grid.channels]
@@ -133,8 +132,7 @@ def scan_places(fields: Fields, rows: Bytes, rotation_deg: Doubles | None, likel
 
 def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     """Return the score (see `scan_places`), 0 to 1, of the fine field of a query, (C, m, m), on that of a place, (C, n,
-    n), if the query's centre is at `shift` (dx, dy) from the place's, as fractions of the place's side, or up to a cell
-    away."""
+    n), if the query's centre is at `shift` (dx, dy) from the place's, in sides of the place, or up to a cell away."""
     n = place.shape[1]
     dx, dy = (round(fraction * n) for fraction in shift)
     padded = _pad_field(query, n)

@@ -2,8 +2,7 @@
 pooling, on its feature map. A card whose network outputs a descriptor is a technique of the same name.
 
 The techniques of the thesis have parameters: `model` is the name of the network's card, `form` is "float", "8bit" or
-"1bit" (see `vectors`), and `threads` is the number of threads that the network uses. A map depends on neither `form`
-nor `threads`."""
+"1bit" (see `vectors`), and `threads` is the number of its threads. A map depends on neither `form` nor `threads`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -93,8 +92,7 @@ def netvlad(
     The `assignment` of a position to the words is "soft" or "hard".
 
     Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, as in thesis
-    4.2.1, not whitened. The words are learned for a finished network, like those with which the paper's training starts
-    (section 3.1)."""
+    4.2.1, not whitened. The words are learned for a finished network, as before the paper's training (section 3.1)."""
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)

@@ -1,9 +1,8 @@
 """The coarse stage of `cohog` for a forward camera: places of 144 bytes, recognised even if the camera has moved.
 
 The block-normalised HOG is averaged over 12x12 cells (its *grid*), minus the map's mean grid. The L orientations of
-each cell are written as a Fourier series, because neighbouring ones are correlated, and only the signs of its
-coefficients are kept. A query is compared under every shift of its grid, a *hypothesis*: one matrix product compares
-hypotheses and places."""
+each cell are written as a Fourier series, as neighbours are correlated, and only the signs of its coefficients are
+kept. A query is compared under every shift of its grid, a *hypothesis*: one matrix product compares them all."""
 
 from functools import lru_cache
 
@@ -31,9 +30,8 @@ SHIFTS = np.stack([_DX[_HAS_OVERLAP], _DY[_HAS_OVERLAP]], axis=1).astype(np.int8
 def make_grid(blocks: Singles, seen: Bools, used: Bools) -> tuple[Singles, Bools]:
     """Make the grid of a picture from its blocks float32 (n, n, 4 L), each of L orientations for its 2x2 cells. Only
     the central square of the blocks `seen`, bool (n, n), at least 12 wide, is used: it excludes the picture's border.
-    The blocks `used`, bool (n, n), are averaged in each of 12x12 larger cells, which are normalised to length 1 to be
-    independent of contrast and haze. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half
-    of the cell is used."""
+    The blocks `used`, bool (n, n), are averaged in each of 12x12 larger cells, normalised to length 1 against contrast
+    and haze. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half of the cell is used."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
     middle, block_indices = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _list_blocks(n)
     per_block, weights = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), used[middle, middle].ravel()
@@ -66,9 +64,8 @@ def make_hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
 
 
 def scan_codes(queries: Singles, codes: Bytes) -> Singles:
-    """Compare every hypothesis, `queries` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
-    score of each place, float32 (N,): the fraction of equal bits minus that of different ones (1: the same picture, 0:
-    chance)."""
+    """Compare hypotheses, `queries` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns each place's best
+    score, float32 (N,): the fraction of equal bits minus that of different ones (1: the same picture, 0: chance)."""
     transposed = queries.T
     best = np.empty(len(codes), np.float32)
     block = max(1, _BITS_PER_PRODUCT // queries.shape[1])

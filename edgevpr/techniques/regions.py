@@ -29,8 +29,7 @@ _RMAC_SCALES = 3
 class RegionTechnique(VectorTechnique):
     """Base class of the techniques that scan with one vector and compare the best places by their regions. `describe`
     converts a feature map, float32 (C, H, W), to the vector float32 (D,) and the regions float32 (N, C), each of length
-    1 (padded with rows of zeros if there are fewer). `quality` converts bool (N,), True for each real region, to the
-    quality, 0 to 1."""
+    1 (padded with rows of zeros). `quality` converts bool (N,), True for each real region, to the quality, 0 to 1."""
 
     candidates = 40
 

@@ -80,8 +80,7 @@ def compute_soft_weights(local: Singles, words: Singles, sharpness: float) -> Si
 
 def compute_sharpness(words: Singles) -> float:
     """Compute the sharpness for `compute_soft_weights` at which a descriptor equal to a word gives that word, on
-    average, 100 times the weight of the nearest other word, as NetVLAD (section 5, "Training") requires of the training
-    descriptors."""
+    average, 100 times the weight of the nearest other word, as NetVLAD (section 5, "Training") requires."""
     squares = np.einsum("kd,kd->k", words, words)
     distances = squares[:, None] + squares - 2 * words @ words.T
     np.fill_diagonal(distances, np.inf)

@@ -1,5 +1,4 @@
-"""Assigns positions from a `Record` to the pictures of a folder or video: by name, in the order in which the autopilot
-triggered them, or by time."""
+"""Assigns positions from a `Record` to pictures of a folder or video: by name, in the order of triggers, or by time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace

@@ -84,9 +84,8 @@ def list_names(folder: str | Path) -> tuple[str, ...]:
 
 def read_truth(path: str | Path) -> GroundTruth:
     """Read a CSV file with the columns query_file and ref_files (file names separated by spaces; none: the query is off
-    the map). Optional columns are ref_files_loose (references to ignore, unless they are in ref_files too) and status
-    (`ok`, or `novel` for a query off the map; queries with any other status are not scored). Raises UsageError with
-    file, line, value and remedy."""
+    the map). Optional columns are ref_files_loose (references to ignore, unless in ref_files too) and status (`ok`, or
+    `novel` for a query off the map; others are not scored). Raises UsageError with file, line, value and remedy."""
     truth: GroundTruth = {}
     for where, row in _read_rows(Path(path)):
         name = row["query_file"]

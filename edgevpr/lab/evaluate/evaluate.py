@@ -96,10 +96,9 @@ def answer_queries(
     technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: SalienceGate | None = None
 ) -> tuple[list[QueryAnswer], tuple[str, ...]]:
     """Map the references of `dataset` in a temporary file and run every query. Return the judged answers to the scored
-    queries, and the steps that failed for the map (see `open_temporary_map`). `gate` discards queries that are not
-    memorable (None: keep all); the map has all references, as in the thesis (3.3). Raises UsageError if no query has
-    what `options.known` requires, ImageError and ModelError if an image, network or query fails, and MapError if the
-    map cannot be written."""
+    queries, and the map's failed steps (see `open_temporary_map`). `gate` discards unmemorable queries (None: none);
+    the map has all references, as in the thesis (3.3). Raises UsageError if no query has what `options.known` requires,
+    ImageError and ModelError if an image, network or query fails, MapError if the map cannot be written."""
     spec = technique.spec
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
     sequence = options.sequence or spec.sequence

@@ -51,8 +51,7 @@ class TechniqueResult(Figures):
     """Result of a technique (in one form) on a data set: the figures of all scored queries, its weights and its cost.
 
     `queries_off_map` of the queries have no place in the map, so all their matches are wrong. `with_match` are the
-    figures of the others alone (None: these are all queries, or there are none). `unscored` queries have no ground
-    truth.
+    figures of the others alone (None: all queries, or none). `unscored` queries have no ground truth.
 
     `accepted`, `accepted_wrong`, `accepted_off_map`, `accepted_elsewhere` and `discarded` count queries by the fields
     of `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for

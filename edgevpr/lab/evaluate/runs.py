@@ -56,9 +56,8 @@ def measure(
     salience: SalienceConfig,
     progress: Progress,
 ) -> Measurements:
-    """Measure every row on every set. `sets`: data sets by name. `rows`: (technique, its settings) by the label of the
-    row. Raises UsageError for an unknown technique or parameter. If a network or picture cannot be used, only its row
-    fails."""
+    """Measure every row on every set. `sets`: data sets by name. `rows`: (technique, settings) by label. Raises
+    UsageError for an unknown technique or parameter. If a network or picture cannot be used, only its row fails."""
     outcome = Measurements({}, {}, {})
     for name, dataset in sets.items():
         results = []

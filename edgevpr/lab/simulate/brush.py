@@ -92,8 +92,7 @@ def mix_colours(low: tuple[int, int, int], high: tuple[int, int, int], weight: A
 
 
 def smooth_step(values: Array, low: float, high: float) -> Array:
-    """Return 0 below `low`, 1 above `high`, and a linear ramp between. With low > high: 1 below `high`, 0 above
-    `low`."""
+    """Return 0 below `low`, 1 above `high`, a linear ramp between. With low > high: 1 below `high`, 0 above `low`."""
     return np.clip((values - low) / (high - low), 0, 1)
 
 

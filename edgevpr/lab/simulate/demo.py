@@ -51,8 +51,7 @@ _LEGEND = {
 
 
 def run_demo(folder: str | Path) -> str:
-    """Generate both flights, map the first one, fly the second one without a flight controller, and return the results
-    as text.
+    """Generate both flights, map the first, fly the second without a flight controller, and return the results as text.
 
     Writes to `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError if a command fails.

@@ -14,8 +14,7 @@ from edgevpr.techniques.card import describe_weights
 
 
 def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
-    """Return one line for the log: the technique that a flight uses, and why. `is_named`: it is set in the
-    configuration."""
+    """Return a line for the log: the technique that a flight uses, and why. `is_named`: the configuration sets it."""
     spec = recogniser.technique.spec
     parts = ["set in the configuration" if is_named else "the map was built with it"]
     if weights := describe_weights(spec):

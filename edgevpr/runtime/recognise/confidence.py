@@ -1,9 +1,8 @@
 """The confidence model: converts the evidence for a match (see `evidence`) to the probability that it is correct.
 
-A match can be wrong in two ways: the query shows ground outside the map, or it shows the map but the best place is not
-the correct one. Chance agreement is much the same in every map, but maps differ in how much their places look alike. So
-there is one logistic regression for each of the two errors. Both come with edgevpr, and are adapted to a map that is
-large enough (see `calibrate`).
+A match can be wrong in two ways: the query shows ground outside the map, or the best place is not the correct one.
+Chance agreement is much the same in every map, but maps differ in how much their places look alike. So each error has
+its logistic regression. Both come with edgevpr, and are adapted to a map that is large enough (see `calibrate`).
 
 The distribution of the logits of wrong matches was measured on many sites: the highest follow an exponential
 distribution (peaks over threshold: Pickands 1975). The *chance* of a match is the probability that a wrong match has

@@ -144,9 +144,8 @@ class LookAlike:
 
 @dataclass(frozen=True, slots=True)
 class LookAlikes:
-    """The `places` that look alike, by number, in a map of a camera that looks ahead. `overlap`: successive pictures
-    show the same ground, as along a road. Otherwise each place is a single view: the places before and after it in the
-    file show other ground."""
+    """The `places` that look alike, by number, in a map that looks ahead. `overlap`: successive pictures show the same
+    ground, as along a road. Otherwise each place is a single view: its neighbours in the file show other ground."""
 
     overlap: bool
     places: Mapping[int, LookAlike]

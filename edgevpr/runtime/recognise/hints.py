@@ -55,8 +55,7 @@ class Hints:
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
-        """Return these hints as fields of the flight log: radius of the area (None: unknown), and whether a heading is
-        known."""
+        """Return the fields of the flight log: radius of the area (None: unknown), and whether a heading is known."""
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 

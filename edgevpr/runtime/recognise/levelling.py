@@ -105,9 +105,8 @@ class Undistortion:
 def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Undistortion | None:
-    """Make the image preparation for a configuration; None for a camera without a known lens that
-    looks ahead or is on a gimbal. Raises ConfigError for an unusable lens calibration, and UsageError for a field of
-    view that contradicts it."""
+    """Make the image preparation for a configuration; None for a camera of unknown lens that looks ahead or is on a
+    gimbal. Raises ConfigError for an unusable calibration, UsageError for a field of view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
         calibrated = load_calibrated_lens(config)
         return Undistortion(calibrated) if calibrated else None

@@ -46,9 +46,8 @@ _PLACE_TILT_SD = math.tan(math.radians(0.5))
 
 @dataclass(frozen=True, slots=True)
 class AttitudeError:
-    """Tilt of the camera beyond the reported attitude. `nadir_shift` (east, north) is the distance of the point below
-    the camera from its position by the reported attitude, divided by the height above ground. `sd` is the standard
-    deviation of each axis."""
+    """Camera tilt beyond the reported attitude. `nadir_shift` (east, north) is the offset of the point below the camera
+    from its position by the reported attitude, over the height above ground. `sd`: standard deviation of each axis."""
 
     nadir_shift: tuple[float, float]
     sd: float

@@ -1,5 +1,4 @@
-"""`edgevpr check`: checks whether a configuration is ready to fly, by opening and closing everything that `edgevpr run`
-opens."""
+"""`edgevpr check`: checks whether a configuration is ready to fly, by opening and closing all that `run` opens."""
 
 import time
 from contextlib import closing

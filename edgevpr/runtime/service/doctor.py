@@ -26,8 +26,7 @@ _GPS_FIX_TYPE_3D = 3
 
 def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], AutopilotReading | None]:
     """Check the autopilot at the other end of the link `address`, and this machine. Return the findings and the
-    values read from the autopilot (None: nothing was read). Raises ConfigError for an unknown board or a signing key
-    that is unusable."""
+    autopilot's values (None: none). Raises ConfigError for an unknown board or a signing key that is unusable."""
     settings, source = config.mavlink, config.source
     signing = open_signing(settings, is_read_only=True)
     machine_findings = list(check_machine(load_board(config.board), config.log, address))
