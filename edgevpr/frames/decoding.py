@@ -161,8 +161,7 @@ class VideoDecoder:
         )
 
     def fetch(self) -> TimedPacket | None:
-        """Wait for the next packet and return it; None at the end of the file or if the stream is lost. One thread may
-        fetch while another decodes."""
+        """Wait for the next packet; None at the end or if the stream is lost. Another thread may decode meanwhile."""
         index = self.stream.index
         with av.logging.Capture() as log_lines:
             try:

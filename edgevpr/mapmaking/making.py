@@ -1,5 +1,4 @@
-"""Builds a complete map: makes places from pictures, then refines and calibrates the map (`finishing`). The command
-`edgevpr map build` calls it."""
+"""Builds a map (`edgevpr map build`): makes places from pictures, then refines and calibrates it (`finishing`)."""
 
 import logging
 from collections.abc import Callable, Iterator

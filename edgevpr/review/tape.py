@@ -183,8 +183,7 @@ class Playback(Tape):
         """Return immediately: the time comes from the tape."""
 
     def _peek_kind(self) -> str:
-        """Perform the link's turns that are next on the tape, and return the kind of the note after them. Raises
-        TapeEnded."""
+        """Perform the link's turns next on the tape; return the kind of the note after them. Raises TapeEnded."""
         while note := self._peek_note():
             if note[0] != LINK or self.perform_turn is None:
                 return cast(str, note[0])
