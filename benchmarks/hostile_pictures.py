@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import walks
 from base import DATA, Row, camera_of
-from pictures_of_nothing import SPOILT, draw_display, figures, pictures, yield_spoilt
+from pictures_of_nothing import SPOILT, draw_display, overlay_figures, yield_pictures, yield_spoilt
 
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate.dataset import Dataset
@@ -44,7 +44,7 @@ def run(count: int, seed: int, data: Path = DATA, names: Iterable[str] | None = 
         counts: dict[str, Row] = {}
         _ask(folder, _bare(dataset, folders, count, rng, seed + number), counts)
         shape = read_image(dataset.queries[0].path).shape[:2]
-        for what, over in (("a display", draw_display), ("figures", figures)):
+        for what, over in (("a display", draw_display), ("figures", overlay_figures)):
             draw = partial(_drawn, shape=shape, over=over, seed=seed + number)
             asked = _behind(dataset, folders, count, rng, draw)
             _ask(folder, ((f"{kind} behind {what}", image, may_be) for kind, image, may_be in asked), counts, draw)
@@ -77,7 +77,7 @@ def _ask(folder: Path, asked: Iterator[Asked], counts: dict[str, Row], draw: Dra
 
 
 def _bare(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Generator, seed: int) -> Iterator[Asked]:
-    for _, image in pictures(seed, count):
+    for _, image in yield_pictures(seed, count):
         yield "of nothing", image, frozenset()
     queries = -(-count // len(SPOILT))
     for number in rng.choice(len(dataset.queries), queries, replace=queries > len(dataset.queries)):

@@ -18,12 +18,12 @@ RTCP = 200  # second byte of a packet that is no part of a picture
 _SDP = describe_rtp("libx264", 0) + "a=control:track0\r\n"
 
 
-def picture(number):
+def draw_picture(number):
     return np.roll(cv2.GaussianBlur(_NOISE, (9, 9), 0), 7 * number, axis=1)
 
 
 def encode_image(number, extension=".jpg"):
-    return bytes(cv2.imencode(extension, picture(number))[1])
+    return bytes(cv2.imencode(extension, draw_picture(number))[1])
 
 
 class Server:
@@ -64,7 +64,7 @@ def read_request(asked):
     return first, headers
 
 
-def http(status, kind="text/plain", body=b"nothing"):
+def answer_http(status, kind="text/plain", body=b"nothing"):
     """An answer to every request: `body`, or what it returns for the number of the request."""
     numbers = iter(range(10_000))
 
@@ -77,7 +77,7 @@ def http(status, kind="text/plain", body=b"nothing"):
     return answer
 
 
-def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connections=None):
+def answer_multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connections=None):
     """A multipart stream of all pictures in turn. The times of sending go into a list for each connection, in
     `connections`."""
 
@@ -97,7 +97,7 @@ def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connectio
     return answer
 
 
-def rtsp(
+def answer_rtsp(
     status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", authorization=None, sdp=_SDP, play=None
 ):
     """A camera that answers the method `refuses` with `status`. A request for TCP gets a 461, or an "offer" of UDP, or
@@ -138,7 +138,7 @@ class RtspCamera(Server):
 
     def __init__(self, sdp, port=0):
         self._viewers = []
-        answer = rtsp(refuses="", over_tcp="200", sdp=f"{sdp}a=control:track0\r\n", play=self._viewers.append)
+        answer = answer_rtsp(refuses="", over_tcp="200", sdp=f"{sdp}a=control:track0\r\n", play=self._viewers.append)
         super().__init__(answer, port)
         self.uri = f"rtsp://{self.address}/camera"
 
@@ -165,6 +165,6 @@ def send_rtp(port, is_on, codec="libx264"):
     for number in itertools.count():
         if not is_on.is_set():
             break
-        encoder.write(number, picture(number))
+        encoder.write(number, draw_picture(number))
         time.sleep(1 / RATE_HZ)
     encoder.close()

@@ -18,7 +18,7 @@ INSERT INTO places (geom, time, alt_m, heading_deg, source_image, quality, coars
 """
 
 
-def file_bytes(spec: TechniqueSpec, places: int) -> int:
+def estimate_file_bytes(spec: TechniqueSpec, places: int) -> int:
     """About how large the file of such a map is; while it is written, no more than this is needed."""
     fine = spec.fine.nbytes if spec.fine else 0
     return places * math.ceil(1.1 * (spec.coarse.nbytes + fine + 100)) + 200_000

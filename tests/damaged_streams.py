@@ -19,7 +19,7 @@ import numpy as np
 from answering_cameras import RTCP, RtspCamera
 from encoders import Encoder, describe_rtp
 from loopback import free_port
-from numbered_pictures import HEIGHT, WIDTH, picture, read_numbers
+from numbered_pictures import HEIGHT, WIDTH, draw_picture, read_numbers
 
 from edgevpr.frames.decoding import TimedPacket, VideoDecoder
 from edgevpr.frames.shot import Condition
@@ -68,7 +68,7 @@ class Film:
         """Yield number and picture when each is due."""
         start_s = time.monotonic()
         for number in range(self.count):
-            shown = picture(number)
+            shown = draw_picture(number)
             time.sleep(max(0.0, start_s + number / self.rate_hz - time.monotonic()))
             yield number, shown
 
@@ -156,7 +156,7 @@ class LossyCamera(Camera):
 
     def _send(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            give = partial(self._hand_on, out)
+            give = partial(self._forward, out)
             encoder = Encoder(give, self._form, self._codec, self._film.rate_hz, (WIDTH, HEIGHT), self._options)
             self._rolls.wait()
             for number, shown in self._film.play():
@@ -165,7 +165,7 @@ class LossyCamera(Camera):
             encoder.close()
         self.done.set()
 
-    def _hand_on(self, out: socket.socket, data: bytes) -> None:
+    def _forward(self, out: socket.socket, data: bytes) -> None:
         size = _TS_BYTES if self._form == "mpegts" else len(data)
         for datagram in (data[start : start + size] for start in range(0, len(data), size)):
             is_rtcp = self._form == "rtp" and datagram[1] == RTCP

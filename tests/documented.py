@@ -12,7 +12,7 @@ SCHEMA = Path(__file__).parents[1] / "docs/reference/json-output.yaml"
 
 
 @cache
-def schema() -> dict[str, Any]:
+def read_schema() -> dict[str, Any]:
     """The schema, strictly: every field is documented, and is there where it is promised."""
     whole = yaml.safe_load(SCHEMA.read_text("utf-8"))
     for name, part in whole["$defs"].items():
@@ -35,7 +35,7 @@ def require_documented(command: str, printed: str) -> None:
     """Raise a ValidationError if the output of a command is not as its schema says."""
     from jsonschema import Draft202012Validator
 
-    Draft202012Validator({"$ref": f"#/$defs/{command}", **schema()}).validate(json.loads(printed))
+    Draft202012Validator({"$ref": f"#/$defs/{command}", **read_schema()}).validate(json.loads(printed))
 
 
 class Checked:

@@ -12,7 +12,7 @@ SIZES = ((480, 640), (360, 640), (576, 720), (240, 320), (720, 1280), (240, 640)
 _BARS = ((191, 191, 191), (0, 191, 191), (191, 191, 0), (0, 191, 0), (191, 0, 191), (0, 0, 191), (191, 0, 0))  # BGR
 
 
-def _bars(rng, height, width):
+def _draw_bars(rng, height, width):
     picture = fill(height, width, 0)
     edges = np.linspace(0, width, len(_BARS) + 1).astype(int)
     low = int(height * rng.uniform(0.6, 1.0))
@@ -24,7 +24,7 @@ def _bars(rng, height, width):
     return add_grain(picture, rng, rng.choice((0, 2, 6)))
 
 
-def _blue(rng, height, width):
+def _draw_blue(rng, height, width):
     picture = fill(height, width, (int(rng.integers(120, 256)), int(rng.integers(0, 60)), int(rng.integers(0, 60))))
     for row in range(int(rng.integers(1, 6))):
         text = str(rng.choice(("NO SIGNAL", "VIDEO LOSS", "CH 5  5865 MHz", "CHECK CONNECTION", "RX1 LOST", "AV1")))
@@ -32,7 +32,7 @@ def _blue(rng, height, width):
     return add_grain(picture, rng, rng.choice((0, 3)))
 
 
-def _logo(rng, height, width):
+def _draw_logo(rng, height, width):
     picture = fill(height, width, draw_colour(rng, 0, 40))
     x, y = int(rng.uniform(0.2, 0.8) * width), int(rng.uniform(0.2, 0.8) * height)
     size = int(rng.uniform(0.05, 0.2) * height)
@@ -42,7 +42,7 @@ def _logo(rng, height, width):
     return picture
 
 
-def _card(rng, height, width):
+def _draw_card(rng, height, width):
     """Draw a test card: grid, circle, wedges, grey steps."""
     picture, step = fill(height, width, 128), int(rng.integers(16, 64))
     for x in range(step // 2, width, step):
@@ -60,7 +60,7 @@ def _card(rng, height, width):
     return picture
 
 
-def figures(picture, rng):
+def overlay_figures(picture, rng):
     """Write the figures that a flight controller writes over a picture."""
     texts = ("16.2V", "12.4A", "ALT 83m", "GPS 14", "12:31", "ACRO", "RSSI 87", "HOME 412m", "-35.363261", "DISARMED")
     for text in rng.permutation(texts)[: rng.integers(3, len(texts) + 1)]:
@@ -70,7 +70,7 @@ def figures(picture, rng):
 
 def draw_display(picture, rng):
     """Draw what a flight controller draws over a picture: figures, a cross, a ladder, a horizon line."""
-    height, width = figures(picture, rng).shape[:2]
+    height, width = overlay_figures(picture, rng).shape[:2]
     middle, white = (width // 2, height // 2), (255, 255, 255)
     cv2.drawMarker(picture, middle, white, cv2.MARKER_CROSS, height // 12, 2)
     roll = np.tan(rng.normal(0, 0.2))
@@ -85,12 +85,12 @@ def draw_display(picture, rng):
     return picture
 
 
-def _display_on_dark(rng, height, width):
+def _draw_dark_display(rng, height, width):
     ground = blend_colours(make_clouds(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
     return draw_display(add_grain(ground, rng, rng.uniform(0.5, 4)), rng)
 
 
-def _specks(rng, height, width):
+def _draw_specks(rng, height, width):
     picture, dark = fill(height, width, int(rng.choice((0, 90, 128, 220)))), rng.random() < 0.5
     for _ in range(int(rng.integers(3, 150))):
         at = int(rng.integers(width)), int(rng.integers(height))
@@ -100,7 +100,7 @@ def _specks(rng, height, width):
     return cv2.GaussianBlur(picture, (0, 0), 1.5) if rng.random() < 0.5 else picture
 
 
-def _scratches(rng, height, width):
+def _draw_scratches(rng, height, width):
     picture = fill(height, width, int(rng.integers(0, 256)))
     for _ in range(int(rng.integers(2, 40))):
         ends = [(int(rng.integers(width)), int(rng.integers(height))) for _ in range(2)]
@@ -108,7 +108,7 @@ def _scratches(rng, height, width):
     return picture
 
 
-def _interlaced(rng, height, width):
+def _draw_interlaced(rng, height, width):
     """Draw rows or columns: comb, hum bars, a torn synchronisation."""
     rows = np.arange(height)
     period = rng.uniform(2, 60)
@@ -121,16 +121,16 @@ def _interlaced(rng, height, width):
     return add_grain(blend_colours(share, draw_colour(rng), draw_colour(rng)), rng, rng.choice((0, 3, 10)))
 
 
-def _torn(rng, height, width):
+def _draw_torn(rng, height, width):
     """Draw bars or clouds whose rows have slipped sideways: lost synchronisation."""
-    picture = _bars(rng, height, width) if rng.random() < 0.5 else _sky(rng, height, width)
+    picture = _draw_bars(rng, height, width) if rng.random() < 0.5 else _draw_sky(rng, height, width)
     slip = np.cumsum(rng.normal(0, rng.uniform(0.5, 20), height)).astype(int)
     if rng.random() < 0.5:
         slip = (np.arange(height) * rng.uniform(-2, 2)).astype(int)
     return np.stack([np.roll(row, by, axis=0) for row, by in zip(picture, slip, strict=True)])
 
 
-def _horizon(rng, height, width):
+def _draw_horizon(rng, height, width):
     y, x = np.mgrid[:height, :width]
     line = height * rng.uniform(0.2, 0.8) + np.tan(rng.normal(0, 0.3)) * (x - width / 2)
     below = np.clip((y - line) / rng.uniform(1, 12) + 0.5, 0, 1)
@@ -138,7 +138,7 @@ def _horizon(rng, height, width):
     return add_grain(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 3)), rng, rng.choice((0, 2, 5)))
 
 
-def _sky(rng, height, width):
+def _draw_sky(rng, height, width):
     share = make_clouds(rng, height, width, rng.uniform(16, 200), int(rng.integers(3, 7)))
     share = np.clip((share - rng.uniform(0.2, 0.6)) * rng.uniform(1, 5), 0, 1)
     share = share + np.linspace(0, rng.uniform(0, 0.5), height)[:, None]
@@ -149,7 +149,7 @@ def _sky(rng, height, width):
     return add_grain(picture, rng, rng.uniform(0, 3))
 
 
-def _cap(rng, height, width):
+def _draw_cap(rng, height, width):
     picture = fill(height, width, 0) + rng.normal(rng.uniform(0, 8), rng.uniform(0.5, 6), (height, width, 1))
     picture = picture + rng.normal(0, rng.uniform(0, 3), (1, width, 1))  # the columns of a sensor differ
     hot = rng.random((height, width)) < rng.uniform(0, 2e-3)
@@ -157,19 +157,19 @@ def _cap(rng, height, width):
     return np.clip(picture, 0, 255).astype(np.uint8)
 
 
-def _fog(rng, height, width):
+def _draw_fog(rng, height, width):
     base, depth = rng.uniform(90, 220), rng.uniform(2, 25)
     share = make_clouds(rng, height, width, rng.uniform(4, 60), 4)
     return add_grain(blend_colours(share, base - depth, base + depth), rng, rng.uniform(0, 4))
 
 
-def _bright(rng, height, width):
+def _draw_bright(rng, height, width):
     """Draw over-exposed ground: white, with a few greys left."""
     share = make_clouds(rng, height, width, rng.uniform(10, 120), 4)
     return add_grain(blend_colours(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
 
 
-def _white_noise(rng, height, width):
+def _draw_white_noise(rng, height, width):
     middle, sigma = rng.uniform(40, 200), rng.uniform(5, 90)
     channels = 1 if rng.random() < 0.6 else 3
     return np.clip(fill(height, width, 0) + rng.normal(middle, sigma, (height, width, channels)), 0, 255).astype(
@@ -177,7 +177,7 @@ def _white_noise(rng, height, width):
     )
 
 
-def _banded_noise(rng, height, width):
+def _draw_banded_noise(rng, height, width):
     """Draw noise of one bandwidth, which may differ along rows and columns."""
     noise = rng.standard_normal((height, width)).astype(np.float32)
     along, across = np.exp(rng.uniform(np.log(0.5), np.log(25), 2))
@@ -186,7 +186,7 @@ def _banded_noise(rng, height, width):
     return np.clip(noise[..., None] + fill(height, width, 0), 0, 255).astype(np.uint8)
 
 
-def _snow(rng, height, width):
+def _draw_snow(rng, height, width):
     """Draw the snow of an analogue receiver: dots that run along the rows."""
     noise = cv2.GaussianBlur(rng.random((height, width)).astype(np.float32), (0, 0), rng.uniform(0.5, 3), sigmaY=0.1)
     picture = blend_colours(cv2.normalize(noise, None, 0, 1, cv2.NORM_MINMAX), 0, 255)
@@ -195,7 +195,7 @@ def _snow(rng, height, width):
     return picture
 
 
-def _blocks(rng, height, width):
+def _draw_blocks(rng, height, width):
     """Draw the blocks of a codec that has lost its reference."""
     size = int(rng.choice((8, 16, 32)))
     small = rng.normal(128, rng.uniform(5, 60), (-(-height // size), -(-width // size), 1))
@@ -203,7 +203,7 @@ def _blocks(rng, height, width):
     return add_grain(picture + fill(height, width, 0), rng, rng.choice((0, 2)))
 
 
-def _tiles(rng, height, width):
+def _draw_tiles(rng, height, width):
     """Draw one small patch over and over."""
     side_y, side_x = (int(side) for side in rng.integers(12, 130, 2))
     patch = blend_colours(make_clouds(rng, side_y, side_x, rng.uniform(4, 40), 3), draw_colour(rng), draw_colour(rng))
@@ -213,7 +213,7 @@ def _tiles(rng, height, width):
     return add_grain(np.tile(patch, times)[:height, :width], rng, rng.choice((0, 2)))
 
 
-def _checks(rng, height, width):
+def _draw_checks(rng, height, width):
     side_y, side_x = (int(side) for side in rng.integers(6, 90, 2))
     y, x = np.mgrid[:height, :width]
     share = ((y // side_y + x // side_x) % 2).astype(np.float32)
@@ -221,35 +221,35 @@ def _checks(rng, height, width):
 
 
 NOTHING: dict[str, Draw] = {
-    "no signal: bars": _bars,
-    "no signal: blue": _blue,
-    "no signal: logo": _logo,
-    "no signal: snow": _snow,
-    "test card": _card,
+    "no signal: bars": _draw_bars,
+    "no signal: blue": _draw_blue,
+    "no signal: logo": _draw_logo,
+    "no signal: snow": _draw_snow,
+    "test card": _draw_card,
     "display on blank": lambda rng, *size: draw_display(fill(*size, int(rng.choice((0, 16, 60, 128)))), rng),
-    "display on dark": _display_on_dark,
-    "display on fog": lambda rng, *size: draw_display(_fog(rng, *size), rng),
+    "display on dark": _draw_dark_display,
+    "display on fog": lambda rng, *size: draw_display(_draw_fog(rng, *size), rng),
     "blank": lambda rng, *size: add_grain(fill(*size, draw_colour(rng)), rng, rng.choice((0, 0.5, 1))),
-    "specks": _specks,
-    "scratches": _scratches,
-    "interlaced": _interlaced,
-    "torn": _torn,
-    "horizon": _horizon,
-    "sky": _sky,
-    "lens cap": _cap,
-    "fog": _fog,
-    "over-exposed": _bright,
-    "white noise": _white_noise,
-    "banded noise": _banded_noise,
-    "codec blocks": _blocks,
-    "tiles": _tiles,
-    "checks": _checks,
+    "specks": _draw_specks,
+    "scratches": _draw_scratches,
+    "interlaced": _draw_interlaced,
+    "torn": _draw_torn,
+    "horizon": _draw_horizon,
+    "sky": _draw_sky,
+    "lens cap": _draw_cap,
+    "fog": _draw_fog,
+    "over-exposed": _draw_bright,
+    "white noise": _draw_white_noise,
+    "banded noise": _draw_banded_noise,
+    "codec blocks": _draw_blocks,
+    "tiles": _draw_tiles,
+    "checks": _draw_checks,
 }
 
 Spoil = Callable[[np.random.Generator, np.ndarray], np.ndarray]
 
 
-def _half_covered(rng, picture):
+def _cover_half(rng, picture):
     """Cover half or more of a picture from one side, black or grey."""
     covered, share = picture.copy(), rng.uniform(0.5, 0.9)
     height, width = picture.shape[:2]
@@ -258,7 +258,7 @@ def _half_covered(rng, picture):
     return covered if rng.random() < 0.5 else np.ascontiguousarray(covered[::-1, ::-1])
 
 
-def _strut(rng, picture):
+def _draw_struts(rng, picture):
     """Lay struts across a picture."""
     covered = picture.copy()
     height, width = picture.shape[:2]
@@ -268,7 +268,7 @@ def _strut(rng, picture):
     return covered
 
 
-def _finger(rng, picture):
+def _draw_finger(rng, picture):
     """Lay something blurred and bright over most of a picture."""
     height, width = picture.shape[:2]
     shape = np.zeros((height, width), np.float32)
@@ -279,7 +279,7 @@ def _finger(rng, picture):
     return (picture * (1 - shape) + rng.uniform(60, 160) * shape).astype(np.uint8)
 
 
-def _smeared(rng, picture):
+def _smear(rng, picture):
     """Smear a picture along a line, as a fast turn does."""
     side = max(5, int(picture.shape[1] * rng.uniform(0.05, 0.25)))
     angle = rng.uniform(0, np.pi)
@@ -289,32 +289,32 @@ def _smeared(rng, picture):
     return cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
 
 
-def _nearly_dark(rng, picture):
+def _darken(rng, picture):
     return add_grain(picture * rng.uniform(0.01, 0.06), rng, rng.uniform(0.5, 3))
 
 
-def _mostly_display(rng, picture):
+def _cover_by_display(rng, picture):
     """Draw a display over a picture that is nearly dark."""
-    dark = _nearly_dark(rng, picture)
+    dark = _darken(rng, picture)
     return draw_display(dark if dark.ndim == 3 else cv2.cvtColor(dark, cv2.COLOR_GRAY2BGR), rng)
 
 
 SPOILT: dict[str, Spoil] = {
     "out of focus": lambda rng, it: cv2.GaussianBlur(it, (0, 0), it.shape[1] * rng.uniform(0.01, 0.08)),
-    "half covered": _half_covered,
-    "strut": _strut,
-    "finger": _finger,
-    "smeared": _smeared,
+    "half covered": _cover_half,
+    "strut": _draw_struts,
+    "finger": _draw_finger,
+    "smeared": _smear,
     "washed out": lambda rng, it: np.clip(it * rng.uniform(2, 8), 0, 255).astype(np.uint8),
-    "nearly dark": _nearly_dark,
+    "nearly dark": _darken,
     "foggy": lambda rng, it: add_grain(it * rng.uniform(0.01, 0.08) + rng.uniform(100, 200), rng, rng.uniform(0.5, 3)),
     "noisy": lambda rng, it: add_grain(it, rng, rng.uniform(30, 120)),
     "upside down": lambda rng, it: np.ascontiguousarray(it[::-1, ::-1]),
-    "display on it": _mostly_display,
+    "display on it": _cover_by_display,
 }
 
 
-def pictures(seed: int, count: int) -> Iterator[tuple[str, np.ndarray]]:
+def yield_pictures(seed: int, count: int) -> Iterator[tuple[str, np.ndarray]]:
     """Yield pictures of nothing real: the kind, and uint8 (H, W, 3) BGR. All kinds take turns."""
     for number in range(count):
         kind = list(NOTHING)[number % len(NOTHING)]

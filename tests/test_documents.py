@@ -35,7 +35,7 @@ def read_commands(page: Path) -> list[str]:
 def is_valid(command: str) -> bool:
     """Return whether the command line takes a command; a wrong one is explained on stderr."""
     is_simulated = command.startswith(SIMULATED_AUTOPILOT)
-    parser = autopilot.command_line() if is_simulated else make_parser()
+    parser = autopilot.make_parser() if is_simulated else make_parser()
     try:
         parser.parse_args(shlex.split(command, comments=True)[2 if is_simulated else 1 :])
     except SystemExit as ended:

@@ -109,17 +109,17 @@ def link(request):
         autopilot.finish()
 
 
-def fix(clock, age_s=0.0):
+def make_fix(clock, age_s=0.0):
     return Fix(50.0, 8.0, 20.0, clock.now_s - age_s)
 
 
 def test_send_fix_is_answered_or_dropped_and_link_reports_the_vehicle(link):
     link, clock = link
-    old = link.send_fix(fix(clock, age_s=6.2))
+    old = link.send_fix(make_fix(clock, age_s=6.2))
     old.wait(10.0)
     assert (old.sent, old.why.code) == (False, ReasonCode.FRAME_TOO_OLD)
     assert (link.stats().fixes_sent, link.stats().dropped_stale_fixes) == (0, 1)
-    sending = link.send_fix(fix(clock))
+    sending = link.send_fix(make_fix(clock))
     sending.wait(10.0)
     assert (sending.sent, sending.why) == (True, None)
     assert wait_until(lambda: sending.answer) == "ACCEPTED"
@@ -173,7 +173,7 @@ def test_send_fix_waits_a_second_for_an_autopilot(kind):
         link.start()
     assert not link.is_alive()
     assert link.vehicle() is None
-    sending = link.send_fix(fix(clock))
+    sending = link.send_fix(make_fix(clock))
     assert sending.sent is None
     clock.now_s += 1.1
     wait_until(lambda: link.stats().dropped_stale_fixes == 1)

@@ -24,7 +24,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 PLACES = 6
 
 
-def view(place, rotation_deg=0.0):
+def draw_view(place, rotation_deg=0.0):
     """The ground at a place, seen from straight above."""
     return render_view(draw_texture(place, 800, 800), 320, rotation_deg)
 
@@ -37,8 +37,8 @@ def flight(tmp_path_factory):
     for side in ("mapped", "later"):
         (folder / side).mkdir()
     for place in range(PLACES):
-        cv2.imwrite(str(folder / "mapped" / f"{place}.jpg"), view(place))
-        cv2.imwrite(str(folder / "later" / f"{place}.jpg"), cv2.convertScaleAbs(view(place, 45), alpha=0.8))
+        cv2.imwrite(str(folder / "mapped" / f"{place}.jpg"), draw_view(place))
+        cv2.imwrite(str(folder / "later" / f"{place}.jpg"), cv2.convertScaleAbs(draw_view(place, 45), alpha=0.8))
         rows.append(f"{place}.jpg,{50 + 0.002 * place:.6f},8,0")
     (folder / "mapped" / "positions.csv").write_text("\n".join(rows) + "\n")
     return folder
@@ -92,19 +92,19 @@ def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
                 ground.match(image)
         for kind in (np.float64, np.uint16):
             with pytest.raises(ImageError, match="of uint8"):
-                ground.match(view(1).astype(kind))
+                ground.match(draw_view(1).astype(kind))
         for known in ({"heading_deg": "north"}, {"height_m": float("nan")}, {"near": (50.0, 8.0)}, {"t_s": "now"}):
             with pytest.raises(UsageError, match=next(iter(known))):
-                ground.match(view(1), **known)
+                ground.match(draw_view(1), **known)
     with pytest.raises(UsageError, match="closed"):
-        ground.match(view(1))
+        ground.match(draw_view(1))
     for wrong in (None, 3):
         with pytest.raises(UsageError, match="path"):
             edgevpr.Map(wrong)
         with pytest.raises(UsageError, match="path"):
             edgevpr.build(tmp_path / "m.gpkg", wrong)
     with edgevpr.Map(valley, fov_deg=60) as ground, pytest.raises(UsageError, match="height_m"):
-        ground.match(view(1))
+        ground.match(draw_view(1))
     with pytest.raises(SourceError, match="nothing"):
         edgevpr.build(
             tmp_path / "m.gpkg", edgevpr.OrthophotoGrid(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)

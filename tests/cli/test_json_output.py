@@ -5,15 +5,15 @@ import json
 import jsonschema
 import pytest
 from commands import list_commands
-from documented import require_documented, schema
+from documented import read_schema, require_documented
 
 from edgevpr.cli.main import make_parser
 
 
 def test_schema_defines_every_command_and_no_other():
-    jsonschema.Draft202012Validator.check_schema(schema())
+    jsonschema.Draft202012Validator.check_schema(read_schema())
     commands = {parser.prog for _, parser in list_commands(make_parser()) if "--json" in parser._option_string_actions}
-    assert {name for name in schema()["$defs"] if name.startswith("edgevpr ")} == commands
+    assert {name for name in read_schema()["$defs"] if name.startswith("edgevpr ")} == commands
 
 
 def test_require_documented_refuses_other_fields():

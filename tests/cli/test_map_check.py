@@ -24,7 +24,7 @@ def flight(tmp_path_factory):
 @pytest.fixture(scope="module")
 def whole_valley(flight, tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "valley.gpkg"
-    assert main(build_command(path, flight)) == 0
+    assert main(list_build_words(path, flight)) == 0
     return path
 
 
@@ -33,7 +33,7 @@ def valley(whole_valley, tmp_path):
     return shutil.copy(whole_valley, tmp_path / whole_valley.name)
 
 
-def build_command(path, flight):
+def list_build_words(path, flight):
     return ["map", "build", str(path), "--images", str(flight / "images"), "--technique", "cohog", "--param", "w1=208"]
 
 
@@ -105,7 +105,7 @@ def run_full(arguments, bytes_at_most):
 
 @pytest.mark.parametrize("bytes_at_most", [1, 5_000, 45_000])
 def test_map_build_leaves_no_empty_map_on_a_full_disk(flight, tmp_path, bytes_at_most, capsys):
-    assert run_full(build_command(tmp_path / "m.gpkg", flight), bytes_at_most) == 1
+    assert run_full(list_build_words(tmp_path / "m.gpkg", flight), bytes_at_most) == 1
     assert "Traceback" not in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 
-def picture(height: int = 48, width: int = 64) -> np.ndarray:
+def draw_picture(height: int = 48, width: int = 64) -> np.ndarray:
     """A picture (height, width, 3) with enough in it for a JPEG of some kilobytes; always the same."""
     noise = np.random.default_rng(7).integers(0, 256, (height, width, 3), dtype=np.uint8)
     return cv2.GaussianBlur(noise, (0, 0), 1.0)
@@ -28,4 +28,4 @@ def write_jpeg(path, gps: dict | None = None, camera: dict | None = None, image:
     exif.update(image or {})
     exif.get_ifd(0x8825).update(gps or {})
     exif.get_ifd(0x8769).update(camera or {})
-    Image.fromarray(picture()).save(path, "JPEG", exif=exif)
+    Image.fromarray(draw_picture()).save(path, "JPEG", exif=exif)

@@ -89,7 +89,7 @@ def test_photograph_lying_on_its_side_is_set_upright(tmp_path):
 )
 def test_read_exif_returns_an_empty_tag_for_missing_or_invalid_data(content, tmp_path, capfd):
     path = tmp_path / "rubbish.jpg"
-    path.write_bytes(photographs.insert_app1(photographs.encode_image(".jpg", photographs.picture()), content))
+    path.write_bytes(photographs.insert_app1(photographs.encode_image(".jpg", photographs.draw_picture()), content))
     assert read_exif(path) == read_exif(tmp_path / "missing.jpg") == GeoTag()
     assert read_image(path).shape == (48, 64, 3)
     assert capfd.readouterr().err == ""

@@ -15,11 +15,11 @@ from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import MAX_PIXELS, list_images, read_image
 
-THUMBNAIL = photographs.encode_image(".jpg", photographs.picture(24, 32))
+THUMBNAIL = photographs.encode_image(".jpg", photographs.draw_picture(24, 32))
 JPEGS = {
-    "baseline": photographs.encode_image(".jpg", photographs.picture()),
-    "progressive": photographs.encode_image(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
-    "restart markers": photographs.encode_image(".jpg", photographs.picture(), cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
+    "baseline": photographs.encode_image(".jpg", photographs.draw_picture()),
+    "progressive": photographs.encode_image(".jpg", photographs.draw_picture(), cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restart markers": photographs.encode_image(".jpg", photographs.draw_picture(), cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
 }
 JPEGS["thumbnail"] = photographs.insert_app1(JPEGS["baseline"], b"not even TIFF" + THUMBNAIL)
 
@@ -56,7 +56,7 @@ def test_read_image_allows_bytes_behind_the_end_of_a_jpeg(kind, tmp_path):
 
 
 WHOLE = [(".jpg", data) for data in JPEGS.values()] + [
-    (extension, photographs.encode_image(extension, photographs.picture()))
+    (extension, photographs.encode_image(extension, photographs.draw_picture()))
     for extension in (".png", ".tif", ".bmp", ".webp", ".ppm")
 ]
 
@@ -169,7 +169,7 @@ def make_files(folder):
     yield photo, 4 + int.from_bytes(photo[4:6], "big")
     yield photographs.insert_app1(photo, xmp), 100
     for extension in (".jpg", ".png", ".tif", ".bmp", ".webp", ".ppm"):
-        yield photographs.encode_image(extension, photographs.picture()), 64
+        yield photographs.encode_image(extension, photographs.draw_picture()), 64
 
 
 @pytest.mark.slow

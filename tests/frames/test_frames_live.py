@@ -13,7 +13,7 @@ from answering_cameras import RtspCamera, Server, read_request
 from encoders import Encoder, describe_rtp
 from fakes import FakeClock
 from loopback import PATIENCE_S, free_port, wait_until
-from numbered_pictures import HEIGHT, WIDTH, picture
+from numbered_pictures import HEIGHT, WIDTH, draw_picture
 
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import live as live_module
@@ -48,7 +48,7 @@ def film():
             for number in itertools.count():
                 if is_over.wait(1 / 60):
                     break
-                encoder.write(number, picture(number))
+                encoder.write(number, draw_picture(number))
 
         thread = threading.Thread(target=send, daemon=True)
         thread.start()

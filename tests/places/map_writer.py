@@ -26,7 +26,7 @@ def frame(number: int) -> Frame:
     )
 
 
-def descriptor(number: int) -> Descriptor:
+def make_descriptor(number: int) -> Descriptor:
     rng = np.random.default_rng(number)
     return Descriptor(coarse=rng.random(64).astype("<f2"), fine=rng.random((40, 32), dtype=np.float32), quality=0.75)
 
@@ -35,7 +35,7 @@ def make_map(path: Path, places: int) -> Path:
     """Make a map of so many places."""
     with PlaceMap.create(path, SPEC) as place_map:
         for number in range(places):
-            place_map.add(frame(number), descriptor(number))
+            place_map.add(frame(number), make_descriptor(number))
     return path
 
 
@@ -50,4 +50,4 @@ if __name__ == "__main__":
     path, start = sys.argv[1], int(sys.argv[2])
     place_map = PlaceMap.open_for_writing(path)
     for number in range(start, start + 100_000):
-        print(place_map.add(frame(number), descriptor(number)), flush=True)
+        print(place_map.add(frame(number), make_descriptor(number)), flush=True)

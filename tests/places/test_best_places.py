@@ -6,14 +6,14 @@ import pytest
 from edgevpr.places.index import choose_places
 
 
-def track(east_m):
+def make_track(east_m):
     lon_deg = np.asarray(east_m, float) / 111_195
     return np.zeros(len(lon_deg)), lon_deg
 
 
 def test_choose_places_keeps_gaps_even_despite_densely_mapped_stretches():
     crowded = np.concatenate((np.arange(0, 100, 10), 100 + np.arange(0, 10, 0.1), np.arange(120, 220, 10)))
-    lat, lon = track(crowded)
+    lat, lon = make_track(crowded)
     kept = choose_places(lat, lon, np.ones(len(crowded)), 22)
     gaps = np.diff(crowded[kept])
     assert len(kept) == 22
@@ -22,7 +22,7 @@ def test_choose_places_keeps_gaps_even_despite_densely_mapped_stretches():
 
 
 def test_choose_places_keeps_the_better_of_two_adjacent_places():
-    lat, lon = track([0, 50, 51, 100])
+    lat, lon = make_track([0, 50, 51, 100])
     assert 1 in choose_places(lat, lon, np.array([1, 0.9, 0.2, 1]), 3)
     assert 2 in choose_places(lat, lon, np.array([1, 0.2, 0.9, 1]), 3)
 

@@ -11,7 +11,7 @@ import sys
 import map_writer
 import numpy as np
 import pytest
-from map_writer import SPEC, descriptor, frame, make_map, write_sql
+from map_writer import SPEC, frame, make_descriptor, make_map, write_sql
 
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.places.examine import check_places
@@ -137,7 +137,7 @@ def test_check_places_misses_only_the_places_on_a_damaged_page(map_path):
             continue  # a page that every map needs
         whole = [each for each in found if not each.problem]
         for each in whole:
-            assert each.content["fine"] == descriptor(each.place_id - 1).fine.tobytes()
+            assert each.content["fine"] == make_descriptor(each.place_id - 1).fine.tobytes()
         lost.append(PLACES - len(whole))
         assert len(whole) + len([each for each in found if each.problem]) >= PLACES - 8 or not whole
     assert lost.count(1) > PLACES, "most pages hold a part of one place"
@@ -158,9 +158,9 @@ def test_place_map_keeps_a_place_whose_name_and_time_cannot_be_written(map_path)
     later = dataclasses.replace(frame(42), name="\ud800.jpg", t_utc_s=1e308)
     with PlaceMap.open_for_writing(map_path) as place_map:
         for number, each in ((41, odd), (42, later)):
-            place_map.add(each, descriptor(number))
+            place_map.add(each, make_descriptor(number))
             (place_id,) = place_map.select_ids("source_image")[(escape_name(each.name),)]
-            assert place_map.has_descriptor(place_id, descriptor(number).coarse)
+            assert place_map.has_descriptor(place_id, make_descriptor(number).coarse)
         *_, first, second = place_map.read_places()
     assert (first.source_image, first.t_utc_s) == ("\\udcff\\udcfe.jpg", None)
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)
@@ -175,7 +175,7 @@ def test_open_for_writing_admits_one_program_at_a_time(map_path):
         with PlaceMap.open(map_path) as reader:  # to look is allowed
             assert len(reader) == len(place_map) == PLACES
     with PlaceMap.open_for_writing(map_path) as again:
-        again.add(frame(41), descriptor(41))
+        again.add(frame(41), make_descriptor(41))
 
 
 def test_open_for_writing_serves_the_triggers_of_a_spatial_index(map_path):
@@ -186,6 +186,6 @@ def test_open_for_writing_serves_the_triggers_of_a_spatial_index(map_path):
         "INSERT INTO boxes VALUES (ST_MinX(NEW.geom), ST_MaxY(NEW.geom)); END",
     )
     with PlaceMap.open_for_writing(map_path) as place_map:
-        place_map.add(frame(41), descriptor(41))
-        place_map.add(frame(45), descriptor(45))  # without a position
+        place_map.add(frame(41), make_descriptor(41))
+        place_map.add(frame(45), make_descriptor(45))  # without a position
         assert place_map.db.execute("SELECT * FROM boxes").fetchall() == [(8.0, pytest.approx(50.0041))]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from map_writer import SPEC, descriptor, frame
+from map_writer import SPEC, frame, make_descriptor
 from ranking import make_index
 
 from edgevpr.core.types import Pose
@@ -18,7 +18,7 @@ def make_layers(path, shown):
     with PlaceMap.create(path, SPEC) as place_map:
         for number, (footprint_m, is_surveyed) in enumerate(shown, start=1):
             pose = Pose(up_deg=0.0, footprint_m=footprint_m, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=is_surveyed)
-            place_map.add(replace(frame(number), pose=pose), descriptor(number))
+            place_map.add(replace(frame(number), pose=pose), make_descriptor(number))
     with PlaceMap.open(path) as place_map:
         return read_layers(place_map)
 

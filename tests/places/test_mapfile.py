@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from map_writer import SPEC, descriptor, frame, make_map, write_sql
+from map_writer import SPEC, frame, make_descriptor, make_map, write_sql
 
 from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
@@ -41,9 +41,9 @@ def test_place_map_returns_what_was_added(map_path):
             assert place.t_utc_s == pytest.approx(added.t_utc_s, abs=1e-3)
             assert place.heading_deg == added.heading_deg
             assert place.position == added.position
-            np.testing.assert_array_equal(place_map.read_fine_part(place.place_id)[0], descriptor(number).fine)
+            np.testing.assert_array_equal(place_map.read_fine_part(place.place_id)[0], make_descriptor(number).fine)
         for number, (_, position, _, coarse) in enumerate(place_map.read_coarse_parts()):
-            np.testing.assert_array_equal(coarse, descriptor(number).coarse)
+            np.testing.assert_array_equal(coarse, make_descriptor(number).coarse)
             assert (position is None) == (frame(number).position is None)
         info = describe_map(place_map)
     assert (info.places, info.with_position) == (10, 8)
@@ -74,7 +74,7 @@ def test_gdal_reads_the_places(map_path):
     assert geometry[0] is None
     lon_lat = np.frombuffer(geometry[3][-16:], "<f8")
     np.testing.assert_allclose(lon_lat, (8.0, 50.0003))
-    np.testing.assert_array_equal(np.frombuffer(columns["coarse"][4], "<f2"), descriptor(4).coarse)
+    np.testing.assert_array_equal(np.frombuffer(columns["coarse"][4], "<f2"), make_descriptor(4).coarse)
 
 
 def test_add_asks_for_disk_space_if_sqlite_is_full(map_path):
@@ -82,9 +82,9 @@ def test_add_asks_for_disk_space_if_sqlite_is_full(map_path):
     (pages,) = place_map.db.execute("PRAGMA page_count").fetchone()
     place_map.db.execute(f"PRAGMA max_page_count = {pages + 1}")
     with pytest.raises(MapError, match="disk"):
-        [place_map.add(frame(number), descriptor(number)) for number in range(10, 20)]
+        [place_map.add(frame(number), make_descriptor(number)) for number in range(10, 20)]
     place_map.db.execute("PRAGMA max_page_count = 100000")
-    place_map.add(frame(20), descriptor(20))  # room again: it goes on
+    place_map.add(frame(20), make_descriptor(20))  # room again: it goes on
     place_map.close()
     with PlaceMap.open(map_path) as again:
         assert len(again) >= 11
@@ -120,12 +120,12 @@ def test_create_never_overwrites_an_existing_map(map_path):
 def test_merge_maps_copies_new_places_and_refuses_other_techniques(map_path, tmp_path):
     with PlaceMap.create(tmp_path / "other.gpkg", SPEC) as other:
         for number in (8, 9, 10, 11):
-            other.add(frame(number), descriptor(number))
+            other.add(frame(number), make_descriptor(number))
     assert merge_maps([map_path, other.path], tmp_path / "both.gpkg") == ([(10, 0), (2, 2)], False)
     with PlaceMap.open(tmp_path / "both.gpkg") as both:
         assert len(both) == 12
         assert describe_map(both).extent[2] == pytest.approx(50.0011)
-        np.testing.assert_array_equal(both.read_fine_part(12)[0], descriptor(11).fine)
+        np.testing.assert_array_equal(both.read_fine_part(12)[0], make_descriptor(11).fine)
     with PlaceMap.create(tmp_path / "third.gpkg", dataclasses.replace(SPEC, parameters={"seed": 3})) as third:
         pass
     with pytest.raises(MapError, match="seed"):
@@ -208,12 +208,12 @@ def test_has_descriptor_tolerates_last_bits_but_not_another_image(map_path):
         for place_id in ids:
             coarse = next(part for number, _, _, part in place_map.read_coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
-                other = coarse + off * np.linalg.norm(coarse) * unit(rng, coarse.shape)
+                other = coarse + off * np.linalg.norm(coarse) * draw_unit_vector(rng, coarse.shape)
                 assert place_map.has_descriptor(place_id, other) is same
         assert not place_map.has_descriptor(10**6, coarse)
 
 
-def unit(rng, shape):
+def draw_unit_vector(rng, shape):
     values = rng.normal(0, 1, shape)
     return values / np.linalg.norm(values)
 
@@ -222,7 +222,7 @@ def test_has_descriptor_tolerates_a_few_different_bytes(tmp_path):
     spec = dataclasses.replace(SPEC, coarse=PartSpec((100,), "|u1"), packed=None)
     there = np.random.default_rng(1).integers(0, 256, 100, np.uint8)
     with PlaceMap.create(tmp_path / "bytes.gpkg", spec) as place_map:
-        place_id = place_map.add(frame(1), dataclasses.replace(descriptor(1), coarse=there))
+        place_id = place_map.add(frame(1), dataclasses.replace(make_descriptor(1), coarse=there))
         for others, same in ((0, True), (3, True), (30, False)):
             again = there.copy()
             again[:others] += 128
@@ -279,6 +279,6 @@ def test_describe_map_reports_the_course_of_a_map_flown_in_one_direction(tmp_pat
                 lat_deg, lon_deg = offset_position(50.0, 8.0, step_m.real, step_m.imag)
                 taken_s = 1.7e9 + 60.0 * line + nth  # the way back to the next line is flown without pictures
                 added = dataclasses.replace(frame(8 * line + nth), position=Position(lat_deg, lon_deg), t_utc_s=taken_s)
-                place_map.add(added, descriptor(nth))
+                place_map.add(added, make_descriptor(nth))
         info = describe_map(place_map)
     assert info.one_way_deg == (None if one_way_deg is None else pytest.approx(one_way_deg, abs=1.0))

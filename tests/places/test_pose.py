@@ -3,7 +3,7 @@
 import dataclasses
 
 import pytest
-from map_writer import SPEC, descriptor, frame, write_sql
+from map_writer import SPEC, frame, make_descriptor, write_sql
 
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Pose, Position
@@ -20,8 +20,8 @@ def posed_map(tmp_path):
     """A map of two places: the first has a pose and landmarks."""
     path = tmp_path / "posed.gpkg"
     with PlaceMap.create(path, SPEC) as place_map:
-        place_map.add(dataclasses.replace(frame(0), pose=POSE), descriptor(0), landmarks=LANDMARKS)
-        place_map.add(frame(1), descriptor(1))
+        place_map.add(dataclasses.replace(frame(0), pose=POSE), make_descriptor(0), landmarks=LANDMARKS)
+        place_map.add(frame(1), make_descriptor(1))
     return path
 
 

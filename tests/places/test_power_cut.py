@@ -11,7 +11,7 @@ from pathlib import Path
 import map_writer
 import numpy as np
 import pytest
-from map_writer import SPEC, descriptor, frame, make_map
+from map_writer import SPEC, frame, make_descriptor, make_map
 
 from edgevpr.places.mapfile import PlaceMap
 
@@ -45,7 +45,7 @@ def test_open_for_writing_recovers_complete_places_from_a_truncated_log(killed, 
         kept[cut] = count_places(path)
         if cut % 10 == 0:
             with PlaceMap.open_for_writing(path) as place_map:
-                place_map.add(frame(kept[cut]), descriptor(kept[cut]))
+                place_map.add(frame(kept[cut]), make_descriptor(kept[cut]))
             assert count_places(path) == kept[cut] + 1
     assert list(kept.values()) == sorted(kept.values()), "what is longer holds no less"
     assert kept[len(log)] >= FIRST + PLACES, "all that was confirmed"
@@ -67,7 +67,7 @@ def count_places(path: Path) -> int:
         assert [place.source_image for place in places] == [frame(number).name for number in range(len(places))]
         for place in places:
             np.testing.assert_array_equal(
-                place_map.read_fine_part(place.place_id)[0], descriptor(place.place_id - 1).fine
+                place_map.read_fine_part(place.place_id)[0], make_descriptor(place.place_id - 1).fine
             )
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     with contextlib.closing(sqlite3.connect(path)) as db:

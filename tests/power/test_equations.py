@@ -22,7 +22,7 @@ TABLE_5_2 = {
 RAIL_V = 2.5  # of the CPU, from which the thesis counts the charge
 
 
-def thesis_ah(u_encode, u_match, t_encode_s, t_match_s):
+def compute_thesis_ah(u_encode, u_match, t_encode_s, t_match_s):
     energy_j = equations.stage_energy_j(0, 1, u_encode, t_encode_s) + equations.stage_energy_j(0, 1, u_match, t_match_s)
     return equations.queries_ah(4781, energy_j / (3600 * RAIL_V))
 
@@ -31,7 +31,7 @@ def thesis_ah(u_encode, u_match, t_encode_s, t_match_s):
 def test_queries_ah_gives_table_5_2_as_its_printed_digits_allow(technique):
     *inputs, expected_ah = TABLE_5_2[technique]
     within = 0.0054 if technique == "CALC" else 0.005  # its t_e is printed with two digits
-    assert thesis_ah(*inputs) == pytest.approx(expected_ah, rel=within)
+    assert compute_thesis_ah(*inputs) == pytest.approx(expected_ah, rel=within)
 
 
 def test_stage_energy_is_idle_energy_plus_marginal_energy():

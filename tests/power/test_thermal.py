@@ -20,21 +20,21 @@ FIRMWARE = "sys/devices/platform/soc/soc:firmware/get_throttled"
 HWMON = "sys/class/hwmon/hwmon"
 
 
-def state(temperature_c, frequency_mhz, throttled, why="", **more):
+def make_state(temperature_c, frequency_mhz, throttled, why="", **more):
     return ThermalState(temperature_c=temperature_c, frequency_mhz=frequency_mhz, throttled=throttled, why=why, **more)
 
 
 @pytest.mark.parametrize(
     ("files", "expected"),
     [
-        ({}, state(48.312, 600.0, False, hot=False)),
-        ({f"{ZONE}1/type": "wifi-thermal\n", f"{ZONE}1/temp": "90000\n"}, state(48.312, 600.0, False, hot=False)),
-        ({f"{ZONE}2/type": "soc0-thermal\n", f"{ZONE}2/temp": "51000\n"}, state(51.0, 600.0, False, hot=False)),
-        ({f"{POLICY}/scaling_max_freq": "1000000\n"}, state(48.312, 600.0, False, hot=False)),  # a power mode
-        ({f"{ZONE}0/temp": "82500\n"}, state(82.5, 600.0, True, "600 of 1800 MHz at 82.5 degrees", hot=True)),
+        ({}, make_state(48.312, 600.0, False, hot=False)),
+        ({f"{ZONE}1/type": "wifi-thermal\n", f"{ZONE}1/temp": "90000\n"}, make_state(48.312, 600.0, False, hot=False)),
+        ({f"{ZONE}2/type": "soc0-thermal\n", f"{ZONE}2/temp": "51000\n"}, make_state(51.0, 600.0, False, hot=False)),
+        ({f"{POLICY}/scaling_max_freq": "1000000\n"}, make_state(48.312, 600.0, False, hot=False)),  # a power mode
+        ({f"{ZONE}0/temp": "82500\n"}, make_state(82.5, 600.0, True, "600 of 1800 MHz at 82.5 degrees", hot=True)),
         (
             {f"{CPU}/cpufreq/policy4/{name}": "2400000" for name in ("cpuinfo_max_freq", "scaling_cur_freq")},
-            state(48.312, 2400.0, False, hot=False),  # the fastest of two clusters
+            make_state(48.312, 2400.0, False, hot=False),  # the fastest of two clusters
         ),
     ],
 )
@@ -48,10 +48,10 @@ def test_thermal_watch_treats_invalid_values_as_unknown(tree, nonsense):
     (root / f"{ZONE}0/temp").write_bytes(nonsense.encode(errors="surrogateescape"))
     (root / f"{POLICY}/scaling_cur_freq").write_bytes(b"-1\n")
     watch = ThermalWatch(root)
-    assert watch.read() == state(None, None, False)
+    assert watch.read() == make_state(None, None, False)
     for name in PI:
         (root / name).unlink()
-    assert watch.read() == state(None, None, False), "where sensors disappear too"
+    assert watch.read() == make_state(None, None, False), "where sensors disappear too"
 
 
 def test_thermal_watch_treats_a_falling_frequency_limit_as_throttling(tree):
@@ -77,7 +77,7 @@ def test_thermal_watch_treats_a_falling_frequency_limit_as_throttling(tree):
     ],
 )
 def test_thermal_watch_reads_the_flags_of_the_firmware(tree, answer, throttled, why, under_voltage, hot):
-    expected = state(48.312, 600.0, throttled, why=why, under_voltage=under_voltage, hot=hot)
+    expected = make_state(48.312, 600.0, throttled, why=why, under_voltage=under_voltage, hot=hot)
     assert ThermalWatch(tree(PI | {FIRMWARE: answer})).read() == expected
 
 
@@ -107,7 +107,7 @@ def test_thermal_watch_is_hot_at_the_temperature_of_the_profile(tree, hot_c, hot
     assert ThermalWatch(tree(PI | {f"{ZONE}0/temp": "75000\n"}), hot_c).read().hot is hot
 
 
-def trips(**points):
+def write_trips(**points):
     return {
         f"{ZONE}0/trip_point_{n}_{what}": f"{value}\n"
         for n, (kind, millidegrees) in enumerate(points.items())
@@ -126,4 +126,4 @@ def trips(**points):
     ],
 )
 def test_thermal_limit_is_the_first_trip_point_of_the_kernel(tree, points, expected_c):
-    assert read_limit_c(tree({f"{ZONE}0/type": "x86_pkg_temp\n"} | trips(**points))) == expected_c
+    assert read_limit_c(tree({f"{ZONE}0/type": "x86_pkg_temp\n"} | write_trips(**points))) == expected_c

@@ -27,7 +27,7 @@ def make_landscape() -> np.ndarray:
     return np.dstack((seen, 255 - seen, seen // 2))
 
 
-def position(east_m: float, north_m: float) -> tuple[float, float]:
+def to_lat_lon(east_m: float, north_m: float) -> tuple[float, float]:
     """A point on the ground (lat_deg, lon_deg)."""
     return offset_position(*ORIGIN, east_m, north_m)
 
@@ -46,7 +46,7 @@ def write_places(folder: Path) -> list[Place]:
         name = f"{at:02d}.png"
         cv2.imwrite(str(folder / name), cv2.warpAffine(ground, way, (width, height)))
         pose = Pose(up_deg=up_deg % 360, footprint_m=SIDE_M, covariance_m2=(1.0, 0.0, 1.0))
-        at_deg = Position(*position(*middle_m.tolist()))
+        at_deg = Position(*to_lat_lon(*middle_m.tolist()))
         places.append(Place(place_id=at + 1, source_image=name, position=at_deg, pose=pose))
     return places
 

@@ -10,7 +10,7 @@ from edgevpr.review.logged import FixOutcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 
-def outcomes(flight):
+def list_outcomes(flight):
     return [each.fix.outcome for each in flight.queries]
 
 
@@ -22,7 +22,8 @@ def test_read_flight_assigns_a_later_answer_to_its_fix(tmp_path):
         for query, result, why in (("a", "ACCEPTED", None), ("b", "DENIED", refused), ("c", None, superseded))
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
-    assert outcomes(flight) == [FixOutcome.ACCEPTED, FixOutcome.REFUSED, FixOutcome.NOT_SENT, FixOutcome.UNANSWERED]
+    names = ["ACCEPTED", "REFUSED", "NOT_SENT", "UNANSWERED"]
+    assert list_outcomes(flight) == [FixOutcome[name] for name in names]
     assert flight.queries[1].fix.why.code is ReasonCode.WRONG_FORM
 
 

@@ -6,7 +6,7 @@ from shutil import copyfile
 import pytest
 from browser import open_page, read_page_data
 from commands import expect_refusal
-from ground import STEP_M, position, write_places
+from ground import STEP_M, to_lat_lon, write_places
 
 from edgevpr.cli.main import main
 from edgevpr.core.types import Position
@@ -24,7 +24,7 @@ def folder(tmp_path_factory):
     (folder / "ref").mkdir()
     places = write_places(folder / "ref")
     copyfile(folder / "ref" / places[5].source_image, folder / "ref" / TWIN)
-    far = replace(places[5], source_image=TWIN, position=Position(*position(300.0, 0.0)), pose=None)
+    far = replace(places[5], source_image=TWIN, position=Position(*to_lat_lon(300.0, 0.0)), pose=None)
     tags = {
         each.source_image: GeoTag(position=each.position, heading_deg=each.pose and each.pose.up_deg)
         for each in [*places, far]
@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
     assert main([*map(str, argv), "--no-calibrate", "--technique", "cohog"]) == 0
     with PlaceMap.open_for_writing(folder / "valley.gpkg") as place_map, place_map.transaction():
         for place in places:
-            recorded = Position(*position(9.0, 90.0)) if place.place_id == 3 else place.position
+            recorded = Position(*to_lat_lon(9.0, 90.0)) if place.place_id == 3 else place.position
             place_map.move_place(place.place_id, place.position, replace(place.pose, recorded=recorded))
     return folder
 
@@ -77,7 +77,7 @@ def test_map_page_is_never_written_over_the_map(folder, capsys):
 def test_find_gaps_finds_ground_missing_between_images(tmp_path):
     places = [
         replace(
-            place, pose=replace(place.pose, up_deg=0.0), position=Position(*position(east * STEP_M, north * STEP_M))
+            place, pose=replace(place.pose, up_deg=0.0), position=Position(*to_lat_lon(east * STEP_M, north * STEP_M))
         )
         for east in range(5)
         for north in range(5)
@@ -94,8 +94,8 @@ def test_find_gaps_finds_ground_missing_between_images(tmp_path):
 
 def test_measure_inconsistent_tags_finds_tags_far_from_their_images(tmp_path):
     places = [
-        replace(place, pose=replace(place.pose, recorded=Position(*position(0.1 * at, 400.0 if at == 4 else 0.0))))
+        replace(place, pose=replace(place.pose, recorded=Position(*to_lat_lon(0.1 * at, 400.0 if at == 4 else 0.0))))
         for at, place in enumerate(write_places(tmp_path))
     ]
-    places = [replace(place, position=Position(*position(0.0, 0.0))) for place in places]
+    places = [replace(place, position=Position(*to_lat_lon(0.0, 0.0))) for place in places]
     assert list(measure_inconsistent_tags(places)) == [5]

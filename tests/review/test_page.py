@@ -16,7 +16,7 @@ from edgevpr.review.page import make_flight_page
 HTML = "<script>alert(1)</script>\"'><img src=http://example.test/x.png>\x1b\u202e\ud800"
 
 
-def page(path):
+def make_page(path):
     return make_flight_page(read_flight(path), [], Album(), Album())
 
 
@@ -68,7 +68,7 @@ def test_flight_page_treats_names_in_the_log_as_text(tmp_path):
         HTML, reason={"code": "UNUSABLE", "parameters": {"problem": HTML}}, reference_image=HTML, accepted=False
     )
     log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": HTML}))
-    content = page(log)
+    content = make_page(log)
     assert content.count("<script") == 2, "the data and the script of the page"
     assert "<img" not in content
     assert "<script>alert(1)</script>" in read_page_data(content)["steps"][0]["title"]
@@ -77,7 +77,7 @@ def test_flight_page_treats_names_in_the_log_as_text(tmp_path):
 
 def test_flight_page_keeps_positions_across_the_date_line_together(tmp_path):
     at = [{"position": None, "fix": None, "located": {"lat_deg": 0.0, "lon_deg": lon}} for lon in (179.999, -179.999)]
-    data = read_page_data(page(write_log(tmp_path / "log", *(("query", query("a", **each)) for each in at))))
+    data = read_page_data(make_page(write_log(tmp_path / "log", *(("query", query("a", **each)) for each in at))))
     assert data["ground"]["box"][2] == pytest.approx(222.6 + 2 * 30, rel=0.01)
 
 

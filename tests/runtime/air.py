@@ -163,10 +163,10 @@ class SimFlight:
 
     def _take_frame(self, step, vehicle, is_query=True) -> None:
         frame = Frame(image=PICTURE, name="", t_mono_s=step * STEP_S)
-        event = Recognition(frame=frame, vehicle=vehicle, odometry=self._stride(step))
+        event = Recognition(frame=frame, vehicle=vehicle, odometry=self._measure_odometry(step))
         self.navigator.handle_frame(event, is_query)
 
-    def _stride(self, step) -> OdometryStep | None:
+    def _measure_odometry(self, step) -> OdometryStep | None:
         before, self.strode = self.strode, step
         if self.stride_sd_m is None or before is None or step - before > _FARTHEST_STEPS:
             return None
@@ -184,7 +184,7 @@ class SimFlight:
         where = Position(*offset_position(*HOME, *seen_m))
         event = make_match(where, step * STEP_S, vehicle, self.said_sd_m, self.places(step))
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
-        event = replace(event, frame=frame, odometry=self._stride(step))
+        event = replace(event, frame=frame, odometry=self._measure_odometry(step))
         if self.shows_turn:
             picture = LevelledImage(PICTURE, None, replace(event.view, up_deg=0.0))
             located = replace(event.located, heading_deg=-math.degrees(self.turn))

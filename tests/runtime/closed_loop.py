@@ -155,9 +155,9 @@ class ClosedLoop:
         else:
             frame = Frame(image=PICTURE, name="", t_mono_s=t_s)
             event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(PICTURE, None, _VIEW))
-        self._waiting.append(replace(event, odometry=self._stride(truth, t_s)))
+        self._waiting.append(replace(event, odometry=self._measure_odometry(truth, t_s)))
 
-    def _stride(self, truth, t_s):
+    def _measure_odometry(self, truth, t_s):
         before, self._last_frame = self._last_frame, (truth, t_s, self.brain.tilt)
         if before is None or not self.sees_motion:
             return None

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from fakes import FakeClock, FakeLink
-from flights import PLACES, STEP_DEG, pictures, prepare_flight
+from flights import PLACES, STEP_DEG, draw_pictures, prepare_flight
 from pictures import write_flight
 
 from edgevpr.cli.main import main
@@ -24,7 +24,7 @@ def recording(tmp_path_factory):
     technique."""
     folder = tmp_path_factory.mktemp("recording")
     for name in ("seen", "blind"):
-        write_flight(folder / name / "images", pictures(PLACES), STEP_DEG)
+        write_flight(folder / name / "images", draw_pictures(PLACES), STEP_DEG)
     (folder / "blind" / "images" / "positions.csv").unlink()
     for technique, parameters in TECHNIQUES.items():
         flags = [word for parameter in parameters for word in ("--param", parameter)]

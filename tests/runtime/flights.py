@@ -88,7 +88,7 @@ def prepare_flight(
     return Flight(folder / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
 
 
-def pictures(count: int, first: int = 0) -> list[Image]:
+def draw_pictures(count: int, first: int = 0) -> list[Image]:
     return [draw_texture(first + number, 240, 320) for number in range(count)]
 
 

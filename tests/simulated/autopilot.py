@@ -160,7 +160,7 @@ def _is_question(message: Message) -> bool:
     return message.get_type() in _QUESTIONS
 
 
-def command_line() -> ArgumentParser:
+def make_parser() -> ArgumentParser:
     """Make the parser of this file's command line."""
     parser = ArgumentParser(description="Simulate an autopilot that answers and counts, until Ctrl-C.")
     parser.add_argument("--link", default="udpin:127.0.0.1:14550", metavar="URL", help="address to listen at")
@@ -178,7 +178,7 @@ def _parse(pair: str) -> tuple[str, float]:
 
 def main() -> None:
     """Simulate an autopilot by the command line, and print what it received, as JSON."""
-    parser = command_line()
+    parser = make_parser()
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it prints what it received

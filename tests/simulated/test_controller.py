@@ -117,7 +117,7 @@ def make_sensor_position(north_m: float = 0.0, eph_m: float = 1.0, slot: int = 1
     return make
 
 
-def odometry(frame: int = mavlink.MAV_FRAME_LOCAL_FRD, quality: int = 50):
+def make_odometry(frame: int = mavlink.MAV_FRAME_LOCAL_FRD, quality: int = 50):
     return lambda flown: mavlink.MAVLink_odometry_message(
         0, frame, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.01] * 21, [0.01] * 21, quality=quality
     )
@@ -209,9 +209,9 @@ def test_copter_uses_odometry_of_the_correct_frame_and_quality():
     flown = Vehicle("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6, VISO_QUAL_MIN=10)
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
     assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
-    for message in (odometry(frame=mavlink.MAV_FRAME_LOCAL_NED), odometry(quality=5)):
+    for message in (make_odometry(frame=mavlink.MAV_FRAME_LOCAL_NED), make_odometry(quality=5)):
         assert not flown.wait(9, message).flags & HAS_POSITION
-    assert flown.wait(10, odometry()).flags & mavlink.EKF_POS_HORIZ_ABS
+    assert flown.wait(10, make_odometry()).flags & mavlink.EKF_POS_HORIZ_ABS
 
 
 OUR_RECEIVER_PRIMARY = {"GPS2_TYPE": 14, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}

@@ -8,7 +8,7 @@ from edgevpr.core.errors import ModelError
 from edgevpr.techniques import network, regions, words
 
 
-def feature_map(seed: int, channels: int = 6, height: int = 7, width: int = 9, dead: float = 0.6) -> np.ndarray:
+def make_feature_map(seed: int, channels: int = 6, height: int = 7, width: int = 9, dead: float = 0.6) -> np.ndarray:
     """Activations after a rectifier: a share `dead` of them is zero."""
     rng = np.random.default_rng(seed)
     alive = rng.random((channels, height, width)) > dead
@@ -89,7 +89,7 @@ def test_compute_sharpness_weights_a_word_a_hundred_times_the_next():
 
 @pytest.mark.parametrize(("dead", "count"), [(0.6, 12), (0.6, 10_000), (0.9, 30), (1.0, 10)])
 def test_regions_are_the_most_energetic_connected_activations(dead, count):
-    features = feature_map(7, channels=5, dead=dead)
+    features = make_feature_map(7, channels=5, dead=dead)
     boxes = regions.find_regions(features, count)
     expected = literal.regions(features, count)
     assert len(boxes) == len(expected)

@@ -14,7 +14,7 @@ SHIFTS_PX = ((0, 0), (40, 0), (-30, 30), (0, -60))
 NOTHING = 0x88
 
 
-def view(seed, rotation_deg=0.0, right_px=0, down_px=0):
+def draw_view(seed, rotation_deg=0.0, right_px=0, down_px=0):
     """The ground of a place."""
     return render_view(draw_texture(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, rotation_deg, right_px, down_px)
 
@@ -22,7 +22,7 @@ def view(seed, rotation_deg=0.0, right_px=0, down_px=0):
 @pytest.fixture(scope="module")
 def town():
     technique = CoHog(camera="nadir")
-    return technique, np.stack([technique.encode(view(seed)).coarse for seed in range(PLACES)])
+    return technique, np.stack([technique.encode(draw_view(seed)).coarse for seed in range(PLACES)])
 
 
 def test_compute_agreement_is_high_at_the_shift_between_two_layouts():
@@ -40,7 +40,7 @@ def test_compute_agreement_is_high_at_the_shift_between_two_layouts():
 @pytest.mark.parametrize("step", range(layout.ROTATIONS))
 def test_score_places_finds_place_and_rotation_of_a_moved_camera(town, step):
     technique, rows = town
-    query = technique.encode(view(step % PLACES, 15 * step, *SHIFTS_PX[step % len(SHIFTS_PX)]))
+    query = technique.encode(draw_view(step % PLACES, 15 * step, *SHIFTS_PX[step % len(SHIFTS_PX)]))
     scores, by_hypothesis = technique.score_places(query, rows, None)
     assert scores.argmax() == step % PLACES
     assert by_hypothesis[step % PLACES].argmax() % layout.ROTATIONS == step
@@ -48,7 +48,7 @@ def test_score_places_finds_place_and_rotation_of_a_moved_camera(town, step):
 
 def test_score_places_examines_only_likely_places_closely(town):
     technique, rows = town
-    query = technique.encode(view(1))
+    query = technique.encode(draw_view(1))
     _, by_hypothesis = technique.score_places(query, rows, None)
     likely = np.arange(PLACES) % 2 == 0
     scores, restricted = technique.score_places(query, rows, None, in_reach=likely)
@@ -62,7 +62,7 @@ def test_score_places_examines_only_likely_places_closely(town):
 @pytest.mark.parametrize("headings", [False, True])
 def test_score_places_scores_all_places_in_reach_and_some_others_of_a_large_map(town, headings):
     technique, rows = town
-    query = technique.encode(view(1))
+    query = technique.encode(draw_view(1))
     large = np.repeat(rows, 12_000 // PLACES, axis=0)
     rotation_deg = np.where(np.arange(len(large)) % 3, 0.0, np.nan) if headings else None
     likely = np.arange(len(large)) % 100 == 7
@@ -82,7 +82,7 @@ def test_rows_of_any_bytes_have_finite_scores(town):
     technique, _ = town
     damaged = np.random.default_rng(2).integers(0, 256, (4, PLACE_BYTES), np.uint8)
     damaged[1:] = np.array([[0], [255], [NOTHING + 1]])
-    scores, by_hypothesis = technique.score_places(technique.encode(view(2)), damaged, None)
+    scores, by_hypothesis = technique.score_places(technique.encode(draw_view(2)), damaged, None)
     assert np.isfinite(scores).all()
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * len(damaged)
 
@@ -93,7 +93,7 @@ def test_score_places_matches_nothing_without_a_good_region(town):
     assert (empty.coarse == NOTHING).all()
     with_empty = np.stack([*rows[:2], empty.coarse])
     assert (technique.score_places(empty, with_empty, None)[0] == 0).all()
-    scores, by_hypothesis = technique.score_places(technique.encode(view(0)), with_empty, None)
+    scores, by_hypothesis = technique.score_places(technique.encode(draw_view(0)), with_empty, None)
     assert scores.argmax() == 0
     assert scores[2] == 0
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * 3
@@ -107,7 +107,7 @@ def list_possible_rotations(by_hypothesis):
 @pytest.mark.slow
 def test_score_places_allows_only_rotations_near_the_expected_one(town):
     technique, rows = town
-    query, rows = technique.encode(view(0)), np.resize(rows, (8, PLACE_BYTES))
+    query, rows = technique.encode(draw_view(0)), np.resize(rows, (8, PLACE_BYTES))
     rotation_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
     scores, by_rotation = technique.score_places(query, rows, None, rotation_deg)
     sets = list_possible_rotations(by_rotation)

@@ -13,14 +13,14 @@ pytestmark = pytest.mark.slow
 SIDE_PX = 384
 
 
-def view(seed, height_ratio=1.0, rotation_deg=0.0, right_px=0.0):
+def draw_view(seed, height_ratio=1.0, rotation_deg=0.0, right_px=0.0):
     return render_view(draw_rough_ground(1100, seed), SIDE_PX, rotation_deg, right_px, height=height_ratio)
 
 
 @pytest.fixture(scope="module")
 def town():
     technique = create("cohog", {"camera": "nadir"})
-    places = [technique.encode(view(seed)) for seed in range(6)]
+    places = [technique.encode(draw_view(seed)) for seed in range(6)]
     return technique, places, np.stack([place.coarse for place in places])
 
 
@@ -37,7 +37,7 @@ def test_decode_hypothesis_gives_a_height_and_a_rotation():
 )
 def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_shift(town, height_ratio, rotation_deg):
     technique, places, rows = town
-    query = technique.encode(view(3, height_ratio, rotation_deg, right_px=24))
+    query = technique.encode(draw_view(3, height_ratio, rotation_deg, right_px=24))
     matches = {}
     for ratio in technique.spec.height_ratios:
         _, by_hypothesis = technique.score_places(query, rows, None, height_ratio=ratio)
@@ -55,14 +55,14 @@ def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_sh
 @pytest.mark.parametrize("height_ratio", [0.5, 1.0, 2.0])
 def test_match_accepts_no_other_ground_at_any_height(town, height_ratio):
     technique, places, _ = town
-    query = technique.encode(view(11, height_ratio))
+    query = technique.encode(draw_view(11, height_ratio))
     for place in places[:2]:
         assert technique.match(query, place.fine).score < technique.min_score
 
 
 def test_score_places_searches_only_the_given_height(town):
     technique, _, rows = town
-    query = technique.encode(view(2, 0.7))
+    query = technique.encode(draw_view(2, 0.7))
     for expected, number in ((None, 2), (0.66, 1), (1.1, 2), (3.0, 4)):
         scores, known = technique.score_places(query, rows, None, None, expected)
         of_height = np.arange(5 * ROTATIONS) // ROTATIONS == number
@@ -74,7 +74,7 @@ def test_score_places_searches_only_the_given_height(town):
 def test_thesis_score_is_searched_at_one_height():
     technique = create("cohog", {"camera": "nadir", "matching": "thesis"})
     assert not technique.spec.height_ratios
-    query = technique.encode(view(1))
+    query = technique.encode(draw_view(1))
     _, by_hypothesis = technique.score_places(query, query.coarse[None], None)
     assert np.flatnonzero(np.isfinite(by_hypothesis[0])).tolist() == list(range(48, 72))
     assert technique.match(query, query.fine).height_ratio == 1.0

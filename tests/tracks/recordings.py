@@ -76,20 +76,20 @@ def write_ulog(path, topics):
     """Write PX4's log. `topics`: the names of each topic's fields with their types, and its rows."""
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)]
 
-    def message(kind, content):
+    def pack_message(kind, content):
         parts.append(struct.pack("<Hc", len(content), kind) + content)
 
-    message(b"B", bytes(40))
+    pack_message(b"B", bytes(40))
     codes = {"uint64_t": "Q", "double": "d", "float": "f", "int32_t": "i", "uint8_t": "B", "float[4]": "4f"}
     for name, (names, _) in topics.items():
-        message(b"F", f"{name}:{''.join(f'{kind} {field};' for field, kind in names.items())}".encode())
+        pack_message(b"F", f"{name}:{''.join(f'{kind} {field};' for field, kind in names.items())}".encode())
     for number, name in enumerate(topics):
-        message(b"A", struct.pack("<BH", 0, number) + name.encode())
+        pack_message(b"A", struct.pack("<BH", 0, number) + name.encode())
     for number, (names, rows) in enumerate(topics.values()):
         layout = "<H" + "".join(codes[kind] for kind in names.values())
         for row in rows:
             flat = [value for cell in row for value in (cell if isinstance(cell, tuple) else (cell,))]
-            message(b"D", struct.pack(layout, number, *flat))
+            pack_message(b"D", struct.pack(layout, number, *flat))
     path.write_bytes(b"".join(parts))
 
 

@@ -15,7 +15,7 @@ from edgevpr.tracks.record import read_record
 FRAME_S = 100.0
 
 
-def vehicles():
+def make_vehicles():
     """Reports at the time of each picture: one that counts, no report, an old one, no GPS, and a fix of ours just now
     and long ago."""
     return (
@@ -34,7 +34,7 @@ def fly(tmp_path, is_live=True):
     with Recording(tmp_path / "recorded", 1000) as recording, FlightLog(tmp_path / "flight.jsonl") as log:
         log.write("start", recording=str(recording.path))
         recording.note("is_live", is_live)
-        for number, vehicle in enumerate(vehicles()):
+        for number, vehicle in enumerate(make_vehicles()):
             recording.note("frame", {"name": f"frame {number}", "number": recording.store_frame(jpeg)})
             log.write("query", query=f"frame {number}", t_frame_s=FRAME_S, vehicle=vehicle)
     return tmp_path / "flight.jsonl", recording.path / "frames"
@@ -52,7 +52,7 @@ def test_positions_places_the_pictures_of_a_flight_while_the_autopilot_had_gps(t
 def test_read_record_refuses_a_flight_without_a_recording_in_one_sentence(tmp_path):
     with FlightLog(tmp_path / "flight.jsonl") as log:
         log.write("start", recording=None)
-        log.write("query", query="frame 0", t_frame_s=FRAME_S, vehicle=vehicles()[0])
+        log.write("query", query="frame 0", t_frame_s=FRAME_S, vehicle=make_vehicles()[0])
     with pytest.raises(UsageError, match="record: FOLDER"):
         read_record(tmp_path / "flight.jsonl")
 

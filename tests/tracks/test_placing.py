@@ -36,7 +36,7 @@ def folder(tmp_path):
     return tmp_path / "flight"
 
 
-def points(count=15, lat_step=1e-4):
+def make_points(count=15, lat_step=1e-4):
     return [(t, HOME[0] + lat_step * t, HOME[1], 120.0, 30.0, 0.0, 0.0, 0.0) for t in range(count)]
 
 
@@ -52,7 +52,7 @@ def test_positions_assigns_images_by_name(capsys, folder, tmp_path):
 
 
 def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
-    write_dataflash(tmp_path / "f.bin", points(), shots=points(6, lat_step=1e-3))
+    write_dataflash(tmp_path / "f.bin", make_points(), shots=make_points(6, lat_step=1e-3))
     found = run_json(capsys, "positions", tmp_path / "f.bin", "--images", folder)
     assert (found["placed"], found["of"], found["offset_s"]) == (6, 6, None)
     tags = read_positions(folder / "positions.csv")
@@ -60,7 +60,7 @@ def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
 
 
 def test_positions_assigns_images_by_time_if_their_number_differs(capsys, folder, tmp_path):
-    write_dataflash(tmp_path / "f.bin", points(), shots=points(3))
+    write_dataflash(tmp_path / "f.bin", make_points(), shots=make_points(3))
     found = run_json(capsys, "positions", tmp_path / "f.bin", "--images", folder)
     assert (found["placed"], found["offset_s"]) == (6, 0)
     tag = read_positions(folder / "positions.csv")["IMG_3.JPG"]

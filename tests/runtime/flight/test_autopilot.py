@@ -4,20 +4,20 @@ things."""
 import numpy as np
 import pytest
 from fakes import FakeSource
-from flights import pictures, prepare_flight, select
+from flights import draw_pictures, prepare_flight, select
 
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW
 
 
-def fixes(lines):
+def list_fixes(lines):
     """Of each query, whether its fix was sent, and why not."""
     return [fix and (fix["sent"], fix["why"]) for fix in (line["fix"] for line in select(lines, "query"))]
 
 
 def test_query_line_has_its_fix_and_the_last_answer(make_flight, clock, link):
-    lines = make_flight().fly(FakeSource(pictures(3), clock))
-    assert fixes(lines) == [(True, None)] * 3
+    lines = make_flight().fly(FakeSource(draw_pictures(3), clock))
+    assert list_fixes(lines) == [(True, None)] * 3
     first = select(lines, "query")[0]["fix"]
     assert (first["query"], first["lat_deg"], first["lon_deg"]) == ("frame 000000", 50.0, 8.0)
     assert [line["result"] for line in select(lines, "answer")] == ["ACCEPTED"] * 3
@@ -26,7 +26,7 @@ def test_query_line_has_its_fix_and_the_last_answer(make_flight, clock, link):
 
 def test_answer_line_precedes_the_next_query(make_flight, clock, link, statuses):
     link.answer = "FAILED"
-    lines = make_flight().fly(FakeSource(pictures(4), clock))
+    lines = make_flight().fly(FakeSource(draw_pictures(4), clock))
     assert [line["kind"] for line in lines if line["kind"] in ("query", "answer")] == ["query", "answer"] * 4
     queries, answers = select(lines, "query"), select(lines, "answer")
     assert [line["query"] for line in answers] == [line["query"] for line in queries]
@@ -35,7 +35,7 @@ def test_answer_line_precedes_the_next_query(make_flight, clock, link, statuses)
 
 
 def test_fix_not_sent_expects_no_answer(make_flight, clock):
-    lines = make_flight(**{"mavlink.send_fixes": False}).fly(FakeSource(pictures(3), clock))
+    lines = make_flight(**{"mavlink.send_fixes": False}).fly(FakeSource(draw_pictures(3), clock))
     assert len(select(lines, "query")) == 3
     assert not select(lines, "answer")
 
@@ -44,22 +44,22 @@ def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, st
     flown = make_flight()
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
-    lines = flown.fly(FakeSource(pictures(3), clock))
+    lines = flown.fly(FakeSource(draw_pictures(3), clock))
     assert all(line["accepted"] for line in select(lines, "query")), "accepted never means sent"
-    assert fixes(lines) == [(False, {"code": "FRAME_TOO_OLD", "parameters": {"age_s": 6.2, "limit_s": 5.0}})] * 3
+    assert list_fixes(lines) == [(False, {"code": "FRAME_TOO_OLD", "parameters": {"age_s": 6.2, "limit_s": 5.0}})] * 3
     assert link.stats().fixes_sent == 0
     assert "2 too late" in statuses[-1]
 
 
 def test_fix_without_a_link_is_reported(recording, tmp_path, clock):
-    lines = prepare_flight(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
-    assert fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
+    lines = prepare_flight(recording, tmp_path, None, clock).fly(FakeSource(draw_pictures(1), clock))
+    assert list_fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
     assert not select(lines, "answer")
 
 
 def test_refused_match_has_no_fix(make_flight, clock, link):
-    lines = make_flight().fly(FakeSource(pictures(2, first=100), clock))
-    assert fixes(lines) == [None, None]
+    lines = make_flight().fly(FakeSource(draw_pictures(2, first=100), clock))
+    assert list_fixes(lines) == [None, None]
     assert link.stats().fixes_sent == 0
 
 
@@ -67,7 +67,7 @@ def test_query_cost_is_sent_for_each_query(make_flight, clock, link):
     flown = make_flight(board="rpi-4b")
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(0.1, 2.0), encode(*seen))[1]
-    flown.fly(FakeSource(pictures(1, first=100), clock))
+    flown.fly(FakeSource(draw_pictures(1, first=100), clock))
     told = {each.name: each.value for each in link.sent if each.get_type() == "NAMED_VALUE_FLOAT"}
     assert told["vpr_cpu"] == pytest.approx(0.5), "two of four cores while the query lasted"
     assert told["vpr_mah"] == pytest.approx(flown.end["used_mah"], rel=0.01)
@@ -75,7 +75,7 @@ def test_query_cost_is_sent_for_each_query(make_flight, clock, link):
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
 def test_confidence_of_an_accepted_match_is_sent_if_known(make_flight, clock, link, technique):
-    lines = make_flight(technique).fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
+    lines = make_flight(technique).fly(FakeSource(draw_pictures(2) + draw_pictures(1, first=100), clock))
     queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, True, False]
     told = [each.value for each in link.sent if getattr(each, "name", "") == "vpr_conf"]
@@ -91,7 +91,7 @@ def test_confidence_of_an_accepted_match_is_sent_if_known(make_flight, clock, li
 @pytest.mark.slow
 def test_camera_lost_is_announced_and_critical_until_it_is_back(make_flight, clock, link):
     health = []
-    source = FakeSource(pictures(5), clock, work=lambda: (health.append(link.health.name), turn())[0])
+    source = FakeSource(draw_pictures(5), clock, work=lambda: (health.append(link.health.name), turn())[0])
 
     def turn():
         source.is_lost = len(health) in (2, 3)
@@ -104,13 +104,13 @@ def test_camera_lost_is_announced_and_critical_until_it_is_back(make_flight, clo
 
 def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, caplog):
     link.send_fix = lambda fix: 1 / 0
-    lines = make_flight().fly(FakeSource(pictures(2), clock))
+    lines = make_flight().fly(FakeSource(draw_pictures(2), clock))
     assert len(select(lines, "query")) == 2
     assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ZeroDivisionError] * 2
 
 
 def test_blank_images_are_reported_once_after_ten_and_so_is_the_ground_again(make_flight, clock, link):
-    health, ground = [], pictures(1, first=1)
+    health, ground = [], draw_pictures(1, first=1)
     seen = [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3]
     lines = make_flight().fly(FakeSource(seen, clock, work=lambda: health.append(link.health)))
     queries = select(lines, "query")

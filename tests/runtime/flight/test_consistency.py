@@ -21,12 +21,12 @@ def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
     """A flight past the places, one a second, with an autopilot that is `off_deg` of longitude off; its lines, link."""
     clock = FakeClock()
 
-    def vehicle():
+    def report_vehicle():
         north = 50 + STEP_DEG * (clock.now_s - 1000.0)
         said = {"has_gps": has_gps, "position_sd_m": 20.0, "velocity_m_s": (0.0, STEP_DEG * 111_195)}
         return make_vehicle(north, 8.0 + off_deg, clock.now_s, **said)
 
-    link = FakeLink(clock, vehicle=vehicle)
+    link = FakeLink(clock, vehicle=report_vehicle)
     flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
     lines = flight.fly(FakeSource([draw_texture(number, 240, 320) for number in pictures], clock))
     return select(lines, "query"), link

@@ -210,7 +210,7 @@ def test_flight_log_refuses_a_path_that_is_not_a_log_at_once(tmp_path, name, sai
 PART_MB = 0.004  # four of them are the limit of the tests below
 
 
-def numbers(path: Path) -> list[int]:
+def read_numbers(path: Path) -> list[int]:
     return [record["n"] for record in read_log(path) if record["kind"] == "query"]
 
 
@@ -229,7 +229,7 @@ def list_parts(path: Path) -> list[Path]:
 def test_flight_log_continues_in_a_new_readable_file_when_full(path, caplog):
     write(path, 120)
     assert [each.name for each in list_parts(path)] == ["flight-0001.jsonl", "flight-0002.jsonl", "flight.jsonl"]
-    assert [n for part in list_parts(path) for n in numbers(part)] == list(range(120))
+    assert [n for part in list_parts(path) for n in read_numbers(part)] == list(range(120))
     (start,), *again = ([each for each in read_log(part) if each["kind"] == "start"] for part in list_parts(path))
     assert again == [[{**start, "repeated": True, "part": part}] for part in (2, 3)]
     assert {read_kinds(part)[0] for part in list_parts(path)} == {"start"}
@@ -241,7 +241,7 @@ def test_flight_log_deletes_the_oldest_files_beyond_the_limit(path):
         write(path, 100, 100 * flight)
         assert sum(part.stat().st_size for part in list_numbered(path)) <= 3e6 * PART_MB, "the newest may grow"
     assert all(part.stat().st_size <= 1e6 * PART_MB for part in list_parts(path))
-    kept = [n for part in list_parts(path) for n in numbers(part)]
+    kept = [n for part in list_parts(path) for n in read_numbers(part)]
     assert kept == list(range(kept[0], 1000))
     assert kept[0] < 900, "the flight before is there still, in part"
     assert {read_kinds(part)[0] for part in list_parts(path)} == {"start"}
@@ -256,7 +256,7 @@ def test_flight_log_continues_in_a_file_that_cannot_be_renamed_and_reports_it_on
     monkeypatch.setattr(os, "replace", refuse)
     write(path, 100)
     log = write(path, 100, 100)
-    assert numbers(path) == list(range(200))
+    assert read_numbers(path) == list(range(200))
     assert not list_numbered(path), "no number is left without a file"
     assert (log.fault, log.lost_lines) == (None, 0)
     said = (
@@ -304,7 +304,7 @@ def test_flight_log_loses_no_line_and_no_file_at_kill_9(path):
             said.append(writing.stdout.readline())
         writing.kill()
         said += writing.communicate()[0].split()
-        kept = [n for part in list_parts(path) if part.exists() for n in numbers(part)]
+        kept = [n for part in list_parts(path) if part.exists() for n in read_numbers(part)]
         assert kept == list(range(kept[0], kept[-1] + 1))
         assert kept[-1] >= int(said[-1]), "what was written is there"
         assert kept[-1] - kept[0] > 20

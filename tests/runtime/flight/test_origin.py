@@ -10,7 +10,7 @@ from edgevpr.core.types import Place, Pose, Position
 from edgevpr.runtime.flight.startup import find_origin
 
 
-def place_map(altitudes_m, footprint_m=100.0, lens=None, is_surveyed=False):
+def make_place_map(altitudes_m, footprint_m=100.0, lens=None, is_surveyed=False):
     def places():
         pose = None
         if footprint_m:
@@ -29,12 +29,12 @@ def place_map(altitudes_m, footprint_m=100.0, lens=None, is_surveyed=False):
 @pytest.mark.parametrize(
     ("places", "ground_m"),
     [
-        (place_map([634.0, 633.0, 9999.0, 635.0, 634.0]), 584.0),
-        (place_map([634.0, "damaged"]), 584.0),
-        (place_map([634.0], footprint_m=None), None),
-        (place_map([None, None]), None),
-        (place_map([634.0], is_surveyed=True), None),
-        (place_map([634.0], lens="other.yaml"), None),
+        (make_place_map([634.0, 633.0, 9999.0, 635.0, 634.0]), 584.0),
+        (make_place_map([634.0, "damaged"]), 584.0),
+        (make_place_map([634.0], footprint_m=None), None),
+        (make_place_map([None, None]), None),
+        (make_place_map([634.0], is_surveyed=True), None),
+        (make_place_map([634.0], lens="other.yaml"), None),
     ],
 )
 def test_find_origin_has_the_altitude_of_the_ground(places, ground_m):
@@ -44,5 +44,5 @@ def test_find_origin_has_the_altitude_of_the_ground(places, ground_m):
 
 def test_find_origin_has_no_altitude_without_lens_or_position():
     source = load_config(None, {}).source
-    assert find_origin(place_map([634.0]), source) == Position(51.0, 8.0, None)
-    assert find_origin(place_map([]), source) is None
+    assert find_origin(make_place_map([634.0]), source) == Position(51.0, 8.0, None)
+    assert find_origin(make_place_map([]), source) is None

@@ -18,7 +18,7 @@ from edgevpr.runtime.flight.boundary import RecordedSource
 from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, list_recordings
 
 
-def notes(folder):
+def read_notes(folder):
     return list(read_tape(folder / TAPE))
 
 
@@ -28,7 +28,7 @@ def test_recording_writes_reads_and_notes_in_order(tmp_path):
         tape.note("two", [1, "a"], None)
         tape.note("three")
     assert tape.path == tmp_path / "r" / "flight-0001"
-    assert notes(tape.path) == [["one", 0.1 + 0.2], ["two", [1, "a"], None], ["three"]]
+    assert read_notes(tape.path) == [["one", 0.1 + 0.2], ["two", [1, "a"], None], ["three"]]
 
 
 @pytest.mark.parametrize("is_grey", [False, True])
@@ -43,7 +43,8 @@ def test_recording_gives_the_flight_the_stored_image(tmp_path, is_grey):
             source.read(0.2)
         assert source.ended
         state = source.state
-    again = ReplayedSource(Playback(iter(notes(tape.path))), lambda number: read_image(frame_path(tape.path, number)))
+    playback = Playback(iter(read_notes(tape.path)))
+    again = ReplayedSource(playback, lambda number: read_image(frame_path(tape.path, number)))
     for frame in seen:
         replayed = again.read(0.2)
         assert np.array_equal(replayed.image, frame.image)
@@ -83,7 +84,7 @@ def test_recording_ends_at_its_size_limit_and_reports_it(tmp_path, caplog):
         tape.note("no more")
     assert "log.record_mb" in tape.state
     assert sum("has ended" in each.message for each in caplog.records) == 1
-    assert ["no more"] not in notes(tape.path)
+    assert ["no more"] not in read_notes(tape.path)
     assert len(list((tape.path / FRAMES).iterdir())) <= 4
 
 
@@ -98,7 +99,7 @@ def test_recording_ends_on_a_full_disk_without_ending_the_flight(tmp_path):
             wait_until(lambda: tape.state)
         tape.note("later")
     assert "too large" in tape.state
-    assert notes(tape.path) == [["x"]]
+    assert read_notes(tape.path) == [["x"]]
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fakes import FakeSource, format_note
-from flights import pictures, select
+from flights import draw_pictures, select
 
 from edgevpr.core.config import load_config
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -93,7 +93,7 @@ def test_sight_reports_tilt_after_five_seconds_and_its_end(sight_flight, tmp_pat
 
 @pytest.mark.slow
 def test_sight_reports_a_flight_that_leaves_its_map_and_returns(make_flight, clock, link):
-    lines = make_flight().fly(FakeSource([*pictures(8), *pictures(40, first=100), *pictures(8)], clock))
+    lines = make_flight().fly(FakeSource([*draw_pictures(8), *draw_pictures(40, first=100), *draw_pictures(8)], clock))
     assert link.texts() == [(4, MAP_LEFT), (6, MAP_FOUND)]
     assert [line["note"]["code"] for line in select(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
 
@@ -125,7 +125,7 @@ def test_sight_reports_images_rotated_from_the_heading_once(notifier, link, rota
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_mirrored_images_are_reported_once_and_only_if_none_matches(make_flight, clock, link, axis):
-    mirrored = [np.flip(picture, axis).copy() for picture in pictures(8)]
+    mirrored = [np.flip(picture, axis).copy() for picture in draw_pictures(8)]
     lines = make_flight().fly(FakeSource([*mirrored, *mirrored, *mirrored[:4]], clock))
     assert not any(line["accepted"] for line in select(lines, "query"))
     assert link.texts() == [(4, f"edgevpr: {ReasonCode.IMAGES_MIRRORED.summary}")]
@@ -134,5 +134,5 @@ def test_mirrored_images_are_reported_once_and_only_if_none_matches(make_flight,
 
 
 def test_pictures_of_other_ground_are_not_reported_as_mirrored(make_flight, clock, link):
-    make_flight().fly(FakeSource(pictures(35, first=100), clock))
+    make_flight().fly(FakeSource(draw_pictures(35, first=100), clock))
     assert link.texts() == []

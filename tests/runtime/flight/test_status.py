@@ -5,7 +5,7 @@ import os
 import pytest
 from commands import expect_refusal, run_json
 from fakes import FakeSource
-from flights import pictures
+from flights import draw_pictures
 
 from edgevpr import __version__
 from edgevpr.cli.main import main
@@ -61,7 +61,7 @@ def test_read_status_refuses_other_files_by_name(path, text):
 def test_top_shows_the_status_of_a_running_flight_only(make_flight, clock, path, capsys):
     assert "--file" in expect_refusal(capsys, "top", "--file", path, "--once", code=1)
     with StatusFile(path) as told:
-        make_flight().fly(FakeSource([*pictures(2), *pictures(1, first=100)], clock), status=told)
+        make_flight().fly(FakeSource([*draw_pictures(2), *draw_pictures(1, first=100)], clock), status=told)
         assert run_json(capsys, "top", "--file", path) == read_status(path)[0]
         assert main(["top", "--file", str(path), "--once"]) == 0
         os.utime(path, (0, 0))

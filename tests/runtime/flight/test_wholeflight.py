@@ -27,7 +27,7 @@ def fly(path: Path, numbers: range, **start) -> None:
         log.write("end")
 
 
-def numbers(lines) -> list[int]:
+def list_numbers(lines) -> list[int]:
     return [line["n"] for line in lines if line["kind"] == "query"]
 
 
@@ -46,22 +46,22 @@ def test_select_last_flight_reads_the_whole_flight_with_one_start_line(path, log
     lines = list(whole)
     assert [line["kind"] for line in lines] == ["start", *["query"] * 4, "end"]
     assert (lines[0]["version"], "repeated" in lines[0]) == ("2", False)
-    assert numbers(lines) == [100, 101, 102, 103]
+    assert list_numbers(lines) == [100, 101, 102, 103]
     assert list(whole.files) == log_files[2:]
     assert whole.missing is None
     assert list(whole) == lines, "it can be read twice"
 
 
 def test_select_last_flight_reads_up_to_the_end_of_a_numbered_file(log_files):
-    assert numbers(select_last_flight(log_files[0])) == [0]
-    assert numbers(select_last_flight(log_files[1])) == [0, 1]
-    assert numbers(select_last_flight(log_files[4])) == [100, 101, 102]
+    assert list_numbers(select_last_flight(log_files[0])) == [0]
+    assert list_numbers(select_last_flight(log_files[1])) == [0, 1]
+    assert list_numbers(select_last_flight(log_files[4])) == [100, 101, 102]
 
 
 def test_select_last_flight_reports_a_missing_file_and_reads_the_rest(path, log_files):
     log_files[3].unlink()
     whole = select_last_flight(path)
-    assert numbers(whole) == [100, 102, 103]
+    assert list_numbers(whole) == [100, 102, 103]
     assert (str(path) in whole.missing, "(1)" in whole.missing) == (True, True)
 
 
@@ -70,7 +70,7 @@ def test_select_last_flight_skips_truncated_lines_of_each_file(path, log_files):
         os.truncate(each, each.stat().st_size - 10)
     with open(path, "ab") as newest:
         newest.write(b'{"kind": "query", "n": 10')
-    assert numbers(select_last_flight(path)) == [103]
+    assert list_numbers(select_last_flight(path)) == [103]
     assert select_last_flight(path).missing is None
 
 
@@ -85,7 +85,7 @@ def test_select_last_flight_accepts_a_repeated_start_line_after_a_storage_change
     later = path.with_name("flight-0001.jsonl")
     path.rename(later)
     path.write_text(json.dumps({**again, "part": 3}) + '\n{"kind": "query", "n": 3}\n')
-    assert numbers(select_last_flight(path)) == [1, 2, 3]
+    assert list_numbers(select_last_flight(path)) == [1, 2, 3]
     assert select_last_flight(path).missing is None
 
 

@@ -50,7 +50,7 @@ def choose_label(board, costs, places):
     return option and option.label
 
 
-def board(**changes):
+def make_board(**changes):
     """A board of 4 cores, of which 2 may be used, with 100 MB for the map and 300 MB for the process."""
     whole = {"title": "Test board", "cores": 4, "cpu_share": 0.5, "budget_mb": 100.0, "memory_max_mb": 300.0}
     return dataclasses.replace(load_board("rpi-4b"), **{**whole, **changes})
@@ -102,26 +102,26 @@ def test_probe_excludes_the_load_of_other_programs():
 
     technique.encode = encode_slowly
     clocks = {"wall_clock": lambda: now["wall"], "cpu_clock": lambda: now["cpu"]}
-    costs = measure_costs(technique, repeat_s=0.2, meter=QueryMeter(board(), **clocks))
+    costs = measure_costs(technique, repeat_s=0.2, meter=QueryMeter(make_board(), **clocks))
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 
 def test_choose_best_returns_the_most_accurate_that_fits(accuracies):
-    assert choose_label(board(), COSTS, places=100) == "regions"
-    assert choose_label(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
-    assert choose_label(board(), COSTS, places=300) == "vector", "regions are too slow"
+    assert choose_label(make_board(), COSTS, places=100) == "regions"
+    assert choose_label(make_board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
+    assert choose_label(make_board(), COSTS, places=300) == "vector", "regions are too slow"
     of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
-    assert choose_label(board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
+    assert choose_label(make_board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
     del accuracies["regions"]
-    assert choose_label(board(), COSTS, 100) == "vector", "what was never measured"
+    assert choose_label(make_board(), COSTS, 100) == "vector", "what was never measured"
 
 
 def test_choose_best_never_returns_one_that_accepted_wrong_places(accuracies):
     accuracies["regions"] = make_accuracy(0.9, wrong=1)
-    assert choose_label(board(), COSTS, 100) == "vector"
+    assert choose_label(make_board(), COSTS, 100) == "vector"
     accuracies["vector"] = make_accuracy(0.5, wrong=2)
-    assert choose_label(board(), COSTS, 100) is None
-    why = explain_no_choice(make_options(board(), COSTS, 100), board())
+    assert choose_label(make_board(), COSTS, 100) is None
+    why = explain_no_choice(make_options(make_board(), COSTS, 100), make_board())
     assert re.findall(r"(regions|vector) \w+ (\d) ", why) == [("regions", "1"), ("vector", "2")]
 
 
@@ -138,25 +138,25 @@ def test_match_scans_a_large_map_whole_and_compares_a_part_of_it():
 
 def test_make_option_counts_the_whole_map_in_ram_and_its_candidates_in_time():
     two_stages = dataclasses.replace(REGIONS, candidates=20)
-    fitting = fit(board(), two_stages, places=50_000)
+    fitting = fit(make_board(), two_stages, places=50_000)
     assert not fitting.misfit
     assert fitting.map_ram_mb == pytest.approx(50.0)
     assert fitting.reachable_hz == pytest.approx(1 / (0.1 + 20 * 0.004))
-    assert not fit(board(), two_stages, 100_000).misfit
-    assert "RAM" in fit(board(), two_stages, 100_100).misfit
+    assert not fit(make_board(), two_stages, 100_000).misfit
+    assert "RAM" in fit(make_board(), two_stages, 100_100).misfit
 
 
 def test_make_option_limits_the_rate_of_a_multicore_technique_by_the_cpu_share():
     four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
-    assert fit(board(cpu_share=1.0), four_threads, 100).reachable_hz == pytest.approx(1 / 0.2)
-    assert fit(board(cpu_share=0.25), four_threads, 100).reachable_hz == pytest.approx(1 / 0.8)
+    assert fit(make_board(cpu_share=1.0), four_threads, 100).reachable_hz == pytest.approx(1 / 0.2)
+    assert fit(make_board(cpu_share=0.25), four_threads, 100).reachable_hz == pytest.approx(1 / 0.8)
 
 
 def test_make_option_refuses_rates_at_which_fixes_would_be_too_late():
-    slow = fit(board(), REGIONS, places=1300, rate_hz=0.1)
+    slow = fit(make_board(), REGIONS, places=1300, rate_hz=0.1)
     assert slow.t_query_s == pytest.approx(5.3)
     assert "takes 5.3 s" in slow.misfit
-    assert not fit(board(), REGIONS, places=1225, rate_hz=0.1).misfit
+    assert not fit(make_board(), REGIONS, places=1225, rate_hz=0.1).misfit
 
 
 def test_find_accuracy_gives_the_figures_of_the_results():

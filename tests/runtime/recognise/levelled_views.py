@@ -15,7 +15,7 @@ _LENS = Lens(math.degrees(2 * math.atan(Camera().width / 2 / Camera().focal_px))
 _LIGHT = Light(sun_azimuth_deg=50, sun_elevation_deg=50)
 
 
-def light_ground(east_m: float, north_m: float) -> np.ndarray:
+def draw_ground(east_m: float, north_m: float) -> np.ndarray:
     """Ground of this size, in the light of a day."""
     return light_scene(make_scene(5, east_m, north_m, _METRES_PER_PIXEL), _LIGHT, 5)
 

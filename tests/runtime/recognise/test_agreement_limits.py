@@ -14,14 +14,14 @@ IDENTITY = Overlay((0.0, 0.0), 0.0, 1.0)
 UNSCALED = Overlay((0.0, 0.0), 0.0)
 
 
-def circle(count, radius=0.3, middle=0.0):
+def make_circle(count, radius=0.3, middle=0.0):
     return middle + radius * np.exp(2j * np.pi * np.arange(count) / count)
 
 
 ANGLE_DEG = 20.0  # of all landmarks on the ground
 
 
-def landmarks(points, angle_deg=ANGLE_DEG, size=1.0, first=0):
+def make_landmarks(points, angle_deg=ANGLE_DEG, size=1.0, first=0):
     """Landmarks at complex points, each described otherwise: the same in all pictures by its number from `first` on."""
     points = np.asarray(points, complex)
     bits = np.random.default_rng(1).integers(0, 256, (100, 32), np.uint8)[first : first + len(points)]
@@ -37,8 +37,8 @@ def join(*each):
 def make_pair(points, shift=0.0, rotation_deg=0.0, scale=1.0, first=0):
     """Landmarks of a place, and those of a query that lies on it so."""
     turn_scale = cmath.rect(scale, math.radians(rotation_deg))
-    query = landmarks((np.asarray(points) - shift) / turn_scale, ANGLE_DEG - rotation_deg, 1 / scale, first)
-    return query, landmarks(points, first=first)
+    query = make_landmarks((np.asarray(points) - shift) / turn_scale, ANGLE_DEG - rotation_deg, 1 / scale, first)
+    return query, make_landmarks(points, first=first)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def make_pair(points, shift=0.0, rotation_deg=0.0, scale=1.0, first=0):
     ],
 )
 def test_agreement_is_found_on_overlays_near_the_expected_one(way, expected, is_near):
-    found = measure_agreement(*make_pair(circle(20), **way), expected)
+    found = measure_agreement(*make_pair(make_circle(20), **way), expected)
     assert found.inliers == (20 if is_near else 0)
     if is_near:
         shift = complex(way.get("shift", 0.0))
@@ -91,10 +91,10 @@ def test_agreement_is_found_on_overlays_near_the_expected_one(way, expected, is_
 )
 @pytest.mark.parametrize("way", [{}, {"shift": 0.1, "rotation_deg": 90.0, "scale": 1.2}])
 def test_landmark_matches_only_at_a_plausible_place_direction_and_size(way, at, moved_by, angle_deg, size, matches):
-    query, place = make_pair(circle(10), **way)
+    query, place = make_pair(make_circle(10), **way)
     turn_scale = cmath.rect(way.get("scale", 1.0), math.radians(way.get("rotation_deg", 0.0)))
-    more = landmarks([turn_scale * at + way.get("shift", 0.0) + moved_by], ANGLE_DEG + angle_deg, size, first=10)
-    asked = landmarks([at], ANGLE_DEG - way.get("rotation_deg", 0.0), 1 / way.get("scale", 1.0), first=10)
+    more = make_landmarks([turn_scale * at + way.get("shift", 0.0) + moved_by], ANGLE_DEG + angle_deg, size, first=10)
+    asked = make_landmarks([at], ANGLE_DEG - way.get("rotation_deg", 0.0), 1 / way.get("scale", 1.0), first=10)
     expected = Overlay((way.get("shift", 0.0), 0.0), way.get("rotation_deg", 0.0), way.get("scale", 1.0))
     assert measure_agreement(join(query, asked), join(place, more), expected).matched == 10 + matches
 
@@ -102,14 +102,14 @@ def test_landmark_matches_only_at_a_plausible_place_direction_and_size(way, at, 
 def test_landmark_matches_at_the_limit_of_its_size():
     most = np.float32(1.35 * 1.2)
     for sizes in ((most, 1.0), (1.0, most)):
-        query, place = make_pair(circle(10))
+        query, place = make_pair(make_circle(10))
         query.size[3], place.size[3] = sizes
         assert measure_agreement(query, place, IDENTITY).matched == 10
 
 
 @pytest.mark.parametrize(("bits", "matches"), [(64, True), (65, False)])
 def test_landmark_matches_with_up_to_a_quarter_of_different_bits(bits, matches):
-    query, place = make_pair(circle(10))
+    query, place = make_pair(make_circle(10))
     flipped = np.unpackbits(query.bits[3])
     flipped[:bits] ^= 1
     query.bits[3] = np.packbits(flipped)
@@ -119,7 +119,7 @@ def test_landmark_matches_with_up_to_a_quarter_of_different_bits(bits, matches):
 
 @pytest.mark.parametrize(("off", "inliers"), [(0.0150, 41), (0.0165, 40)])
 def test_landmark_is_an_inlier_within_the_tolerance(off, inliers):
-    query, place = make_pair([*circle(40), 0.0])
+    query, place = make_pair([*make_circle(40), 0.0])
     place.points[40, 0] = off
     found = measure_agreement(query, place)
     assert (found.inliers, found.matched, found.possible) == (inliers, 41, 41)
@@ -127,7 +127,7 @@ def test_landmark_is_an_inlier_within_the_tolerance(off, inliers):
 
 
 def test_agreement_is_implausible_if_all_inliers_are_outside_the_expected_overlays():
-    query, place = make_pair(circle(12), shift=0.1097)
+    query, place = make_pair(make_circle(12), shift=0.1097)
     place.points[::2, 0] -= 0.004  # half of them alone lie near it
     place.points[1::2, 0] += 0.004
     assert measure_agreement(query, place, IDENTITY).inliers == 0
@@ -135,13 +135,13 @@ def test_agreement_is_implausible_if_all_inliers_are_outside_the_expected_overla
 
 @pytest.mark.parametrize(("count", "inliers"), [(2, 0), (3, 3)])
 def test_measure_agreement_accepts_three_landmarks(count, inliers):
-    found = measure_agreement(*make_pair(circle(count)))
+    found = measure_agreement(*make_pair(make_circle(count)))
     assert (found.inliers, found.matched, found.possible) == (inliers, inliers, count)
 
 
 def test_landmarks_on_one_spot_do_not_agree():
     """What a damaged map may hold."""
-    spot, points = landmarks([0.1] * 20), landmarks(circle(20, 0.2, middle=0.1))
+    spot, points = make_landmarks([0.1] * 20), make_landmarks(make_circle(20, 0.2, middle=0.1))
     for expected in (None, IDENTITY):
         assert measure_agreement(spot, points, expected).inliers == 0
         assert measure_agreement(points, spot, expected).inliers == 0
@@ -150,7 +150,7 @@ def test_landmarks_on_one_spot_do_not_agree():
 @pytest.mark.parametrize(("middle", "off", "variance"), [(0.0, 0.0, 1.0), (0.0, 0.005, 2.0), (0.3, 0.005, 4.0)])
 def test_variance_grows_with_the_residuals_and_the_distance_from_the_centre(middle, off, variance):
     """Twelve landmarks whose errors no rotation, scale or shift takes out: of 24 coordinates four are fitted."""
-    query, place = make_pair(circle(12, middle=middle + 0.05), shift=0.05)
+    query, place = make_pair(make_circle(12, middle=middle + 0.05), shift=0.05)
     place.points[:, 0] += off * (-1.0) ** np.arange(12)
     found = measure_agreement(query, place)
     assert found.shift_share == pytest.approx((0.05, 0.0), abs=1e-5)
@@ -175,16 +175,16 @@ SCALED = {"scale": 1.5}
     ],
 )
 def test_compare_near_returns_another_overlay_supported_by_many_landmarks(as_expected, otherwise, way, is_expected):
-    pairs = make_pair(circle(as_expected, 0.1)), make_pair(circle(otherwise, 0.35), first=50, **way)
+    pairs = make_pair(make_circle(as_expected, 0.1)), make_pair(make_circle(otherwise, 0.35), first=50, **way)
     found = compare_near(*(join(*each) for each in zip(*pairs, strict=True)), IDENTITY)
     assert found.is_expected is is_expected
     assert found.inliers == (as_expected if is_expected else otherwise)
 
 
 def test_compare_near_ignores_displays_and_nearby_overlays():
-    still = make_pair(circle(20))
+    still = make_pair(make_circle(20))
     assert compare_near(*still, Overlay((0.3, 0.0), 0.0, 1.0)).inliers == 0
-    query, place = make_pair(circle(20), shift=0.05, rotation_deg=90.0)
+    query, place = make_pair(make_circle(20), shift=0.05, rotation_deg=90.0)
     wrong = replace(query, angle_deg=query.angle_deg + 90)
     found = compare_near(wrong, place, Overlay((0.0, 0.0), 90.0, 1.0))
     assert (found.inliers, found.is_expected) == (0, True)

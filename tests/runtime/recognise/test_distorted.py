@@ -71,7 +71,7 @@ def maps(ground, lenses, tmp_path_factory):
     return made
 
 
-def errors_m(map_path, camera, ground, **source):
+def measure_errors_m(map_path, camera, ground, **source):
     """How far off the positions of accepted queries are; None for one that is not accepted."""
     settings = load_config(None, {"map": map_path, **{f"source.{key}": value for key, value in source.items()}})
     recogniser, found = open_recogniser(settings, load_board("this")), []
@@ -89,15 +89,15 @@ def errors_m(map_path, camera, ground, **source):
 
 @pytest.mark.parametrize(("of", "by"), [("straight", "wide"), ("wide", "fisheye"), ("fisheye", "straight")])
 def test_cameras_find_their_position_in_the_map_of_any_camera(maps, lenses, ground, of, by):
-    assert max(errors_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
+    assert max(measure_errors_m(maps[of], CAMERAS[by], ground, lens=lenses[by])) < 4.0
 
 
 def test_positions_are_wrong_without_a_calibration(maps, ground):
-    found = errors_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
+    found = measure_errors_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
     assert max(each or math.inf for each in found) > 5.0
 
 
 def test_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
     with pytest.raises(UsageError, match=r"`source\.fov_deg` is 66"):
-        errors_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=66.0)
-    assert errors_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=SEEN_DEG["wide"])
+        measure_errors_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=66.0)
+    assert measure_errors_m(maps["wide"], CAMERAS["wide"], ground, lens=lenses["wide"], fov_deg=SEEN_DEG["wide"])

@@ -49,7 +49,7 @@ def test_step_does_not_search_images_without_information(walk):
 
 
 def test_step_accepts_no_image_of_an_unreal_scene(walk):
-    for kind, picture in pictures_of_nothing.pictures(seed=9000, count=23):
+    for kind, picture in pictures_of_nothing.yield_pictures(seed=9000, count=23):
         event = walk.step(frame(picture, kind))
         assert not event.accepted, f"{kind}: {event.reason}"
 

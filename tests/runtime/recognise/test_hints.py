@@ -17,14 +17,14 @@ WITHIN_DEG = 22.5
 DEG_PER_M = 1 / 111_195  # of latitude
 
 
-def point(metres):
+def to_position(metres):
     return Position(50.0 + metres * DEG_PER_M, 8.0)
 
 
 def make_index(north_m, heading_deg):
     """Places so far to the north (NaN: without a position) with these headings."""
     index = make_bare_index(len(north_m))
-    index.lat_deg[:] = [point(metres).lat_deg for metres in north_m]
+    index.lat_deg[:] = [to_position(metres).lat_deg for metres in north_m]
     index.lon_deg[:] = np.where(np.isnan(north_m), np.nan, 8.0)
     index.heading_deg[:] = heading_deg
     return index
@@ -39,9 +39,9 @@ def vehicle(position, t_received_s):
     return make_vehicle(position.lat_deg, position.lon_deg, t_received_s)
 
 
-def place_match(metres=0.0, heading_deg=None, rotation_deg=None):
+def make_place_match(metres=0.0, heading_deg=None, rotation_deg=None):
     return Candidate(
-        Place(place_id=1, source_image="a", position=point(metres), heading_deg=heading_deg),
+        Place(place_id=1, source_image="a", position=to_position(metres), heading_deg=heading_deg),
         FineMatch(0.5, rotation_deg=rotation_deg),
     )
 
@@ -50,7 +50,7 @@ def make_hints(now_s, index, autopilot=None, fix=None, reach_m_s=10.0, heading_d
     """The hints for a frame at this time, `fix` being our own position and its time (None: there is none)."""
     prior = Prior(reach_m_s, None if heading_deg is None else WITHIN_DEG, is_live=True)
     if fix:
-        prior.update(place_match(fix[0]), True, fix[1])
+        prior.update(make_place_match(fix[0]), True, fix[1])
     frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=now_s, heading_deg=heading_deg)
     return prior.make_hints(frame, autopilot, index, 50.0)
 
@@ -63,18 +63,18 @@ def test_reach_grows_with_the_time_since_the_position_was_known(index):
 
 
 def test_hints_prefer_a_fresh_autopilot_to_our_own_fix_and_both_grow_with_age(index):
-    autopilot, fix = vehicle(point(200), 9.5), (0, 0.0)
-    assert make_hints(10.0, index, autopilot, fix) == Hints(Reach(point(200), 55.0))
+    autopilot, fix = vehicle(to_position(200), 9.5), (0, 0.0)
+    assert make_hints(10.0, index, autopilot, fix) == Hints(Reach(to_position(200), 55.0))
     assert make_hints(10.6, index, autopilot, fix) == Hints(Reach(HOME, pytest.approx(156.0)))
     assert make_hints(60.1, index, None, fix) is None
     assert make_hints(10.0, index) is None
 
 
 def test_to_expectation_allows_only_places_in_reach_and_all_without_a_position(index):
-    expected = to_expectation(Hints(Reach(point(120), 90.0)), 1.0, index)
+    expected = to_expectation(Hints(Reach(to_position(120), 90.0)), 1.0, index)
     assert expected.in_reach.tolist() == [False, True, True, False, False]
     assert expected.rotation_deg is None
-    assert make_hints(10.0, index, vehicle(point(5000), 10.0)) is None, "no place is in reach: all are searched"
+    assert make_hints(10.0, index, vehicle(to_position(5000), 10.0)) is None, "no place is in reach: all are searched"
     everywhere = to_expectation(None, 1.0, index)
     assert (everywhere.in_reach, everywhere.rotation_deg) == (None, None)
 
@@ -91,16 +91,16 @@ def test_to_expectation_gives_the_expected_rotation_of_each_place_if_the_heading
 @pytest.mark.parametrize(
     ("hints", "candidate", "agrees"),
     [
-        (Hints(Reach(HOME, 100.0)), place_match(90), (True, True)),
-        (Hints(Reach(HOME, 100.0)), place_match(110), (False, True)),
+        (Hints(Reach(HOME, 100.0)), make_place_match(90), (True, True)),
+        (Hints(Reach(HOME, 100.0)), make_place_match(110), (False, True)),
         (Hints(Reach(HOME, 100.0)), Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5)), (True, True)),
-        (Hints(heading_deg=10.0), place_match(0, 350.0, 30.0), (True, True)),
-        (Hints(heading_deg=10.0), place_match(0, 350.0, 0.0), (True, True)),
-        (Hints(heading_deg=10.0), place_match(0, 350.0, 345.0), (True, False)),
-        (Hints(heading_deg=10.0), place_match(0, 350.0, 45.0), (True, False)),
-        (Hints(heading_deg=10.0), place_match(0, None, 180.0), (True, True)),
-        (Hints(Reach(HOME, 100.0), 10.0), place_match(0, 10.0, 180.0), (True, False)),
-        (Hints(Reach(HOME, 100.0), 10.0), place_match(110, 10.0, 0.0), (False, True)),
+        (Hints(heading_deg=10.0), make_place_match(0, 350.0, 30.0), (True, True)),
+        (Hints(heading_deg=10.0), make_place_match(0, 350.0, 0.0), (True, True)),
+        (Hints(heading_deg=10.0), make_place_match(0, 350.0, 345.0), (True, False)),
+        (Hints(heading_deg=10.0), make_place_match(0, 350.0, 45.0), (True, False)),
+        (Hints(heading_deg=10.0), make_place_match(0, None, 180.0), (True, True)),
+        (Hints(Reach(HOME, 100.0), 10.0), make_place_match(0, 10.0, 180.0), (True, False)),
+        (Hints(Reach(HOME, 100.0), 10.0), make_place_match(110, 10.0, 0.0), (False, True)),
     ],
 )
 def test_agree_with_accepts_a_place_that_the_hints_would_have_allowed(hints, candidate, agrees):
@@ -114,7 +114,7 @@ def test_prior_alternates_with_and_without_hints_until_a_match_confirms_them(ind
         # The autopilot knows where it is to within 100 m, so that hints are there for every query.
         frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number))
         seen.append(prior.make_hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
-        prior.update(place_match(metres), accepted, float(number))
+        prior.update(make_place_match(metres), accepted, float(number))
     assert seen == [True, False, True, False, True, True, False]
 
 
@@ -127,7 +127,7 @@ def test_prior_keeps_the_area_with_a_wrong_compass_and_the_heading_with_a_wrong_
         hints = prior.make_hints(frame, vehicle(near, float(number)), index, 100.0)
         seen.append(hints and (hints.reach is not None, hints.heading_deg is not None))
         metres, rotation_deg = answer or (50, 0.0)
-        prior.update(place_match(metres, 0.0, rotation_deg), answer is not None, float(number))
+        prior.update(make_place_match(metres, 0.0, rotation_deg), answer is not None, float(number))
     both, area, heading = (True, True), (True, False), (False, True)
     assert seen == [both, area, None, area, area, heading, None, both, None, both]
 
@@ -135,17 +135,18 @@ def test_prior_keeps_the_area_with_a_wrong_compass_and_the_heading_with_a_wrong_
 def test_prior_of_a_certain_flight_narrows_the_search_for_a_minute():
     long_index = make_index(100 * np.arange(40), [np.nan] * 40)
     prior, frame = Prior(None, None, is_live=True), Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=10.0)
-    there = Located(position=point(2000), covariance_m2=(9.0, 0.0, 16.0))
+    there = Located(position=to_position(2000), covariance_m2=(9.0, 0.0, 16.0))
     prior.update_area(there, 0.98, 10.0)
     prior.update_area(None, 1.0, 10.0)
     assert prior.make_hints(frame, None, long_index, 50.0) is None
     prior.update_area(there, 0.99, 10.0)
-    assert prior.make_hints(frame, None, long_index, 50.0) == Hints(Reach(point(2000), 320.0))
-    assert prior.make_hints(frame, None, long_index, 100.0) == Hints(Reach(point(2000), 520.0)), (
+    assert prior.make_hints(frame, None, long_index, 50.0) == Hints(Reach(to_position(2000), 320.0))
+    assert prior.make_hints(frame, None, long_index, 100.0) == Hints(Reach(to_position(2000), 520.0)), (
         "five places on every side"
     )
     prior.update_area(there, 0.5, 12.0)
-    assert prior.make_hints(replace(frame, t_mono_s=14.0), None, long_index, 50.0) == Hints(Reach(point(2000), 440.0))
+    hints = Hints(Reach(to_position(2000), 440.0))
+    assert prior.make_hints(replace(frame, t_mono_s=14.0), None, long_index, 50.0) == hints
     assert prior.make_hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
 
@@ -173,7 +174,7 @@ def test_prior_searches_all_heights_every_second_query_over_unmapped_ground():
     again = []
     for accepted in (False, False, False, True, True, False, False):
         again.append(prior.searches_heights)
-        prior.update(place_match(), accepted, 0.0)
+        prior.update(make_place_match(), accepted, 0.0)
     assert again == [True, False, True, False, True, True, False]
 
 

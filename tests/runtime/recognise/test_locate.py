@@ -18,7 +18,7 @@ CELLS = 32
 FOOTPRINT_M = 64.0
 
 
-def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, turned_deg=0.0, score=0.3, **pose):
+def make_candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, turned_deg=0.0, score=0.3, **pose):
     lat_deg, lon_deg = offset_position(ORIGIN.lat_deg, ORIGIN.lon_deg, east_m, north_m)
     lies = Pose(**{"up_deg": up_deg, "footprint_m": FOOTPRINT_M, "covariance_m2": (4.0, 0.0, 4.0), **pose})
     place = Place(place_id=number, source_image=f"{number}", position=Position(lat_deg, lon_deg, 120.0), pose=lies)
@@ -46,14 +46,14 @@ def measure_offset_m(position):
     ],
 )
 def test_locate_converts_a_shift_in_the_image_to_the_ground(shift, up_deg, there):
-    found = locate([candidate(shift=shift, up_deg=up_deg)], CELLS, View(nadir_offset=(0.0, 0.0)))
+    found = locate([make_candidate(shift=shift, up_deg=up_deg)], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert measure_offset_m(found.position) == pytest.approx(there, abs=0.01)
     assert found.position.alt_m == ORIGIN.alt_m
 
 
 @pytest.mark.parametrize(("up_deg", "turned_deg", "heading_deg"), [(0, 0, 0), (90, 30, 120), (300, 90, 30)])
 def test_locate_adds_the_rotation_to_the_heading_of_the_place(up_deg, turned_deg, heading_deg):
-    found = locate([candidate(up_deg=up_deg, turned_deg=turned_deg)], CELLS)
+    found = locate([make_candidate(up_deg=up_deg, turned_deg=turned_deg)], CELLS)
     assert found.heading_deg == pytest.approx(heading_deg)
 
 
@@ -67,21 +67,21 @@ def test_locate_adds_the_rotation_to_the_heading_of_the_place(up_deg, turned_deg
     ],
 )
 def test_locate_gives_the_position_of_the_aircraft_not_of_the_image_centre(turned_deg, nadir_offset, there):
-    found = locate([candidate(turned_deg=turned_deg)], CELLS, View(nadir_offset=nadir_offset))
+    found = locate([make_candidate(turned_deg=turned_deg)], CELLS, View(nadir_offset=nadir_offset))
     assert measure_offset_m(found.position) == pytest.approx(there, abs=0.01)
 
 
 def test_locate_scales_the_nadir_offset_with_the_height():
     proof = make_agreement(20, (0.0, 0.0), scale=2.0)
-    found = locate([candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
+    found = locate([make_candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
     assert measure_offset_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_locate_prefers_landmarks_to_the_vote():
     proof = make_agreement(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
-    by_vote = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)))
-    found = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)), proof)
+    by_vote = locate([make_candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)))
+    found = locate([make_candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says
     assert measure_offset_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.5)
     assert math.dist(measure_offset_m(found.position), between) > 0.5
@@ -91,7 +91,7 @@ def test_locate_prefers_landmarks_to_the_vote():
 
 
 def test_locate_averages_places_of_the_same_ground():
-    one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
+    one, other = make_candidate(1, shift=(4, 0)), make_candidate(2, shift=(-4, 0), east_m=16.4)
     found = locate([one, other], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert measure_offset_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
     assert found.places == (1, 2)
@@ -101,12 +101,13 @@ def test_locate_averages_places_of_the_same_ground():
 
 
 def test_locate_refuses_contradicting_places():
-    found = locate([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(nadir_offset=(0.0, 0.0)))
+    candidates = [make_candidate(1, shift=(4, 0)), make_candidate(2, east_m=22)]
+    found = locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.objection.code is ReasonCode.POSITIONS_DISAGREE
 
 
 def test_locate_skips_a_slightly_inconsistent_place_without_objection():
-    candidates = [candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)]
+    candidates = [make_candidate(1, shift=(4, 0)), make_candidate(2, shift=(0, 0), east_m=20)]
     found = locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.places == (1,)
     assert found.objection is None
@@ -116,25 +117,25 @@ def test_locate_skips_a_slightly_inconsistent_place_without_objection():
 @pytest.mark.parametrize(
     "other",
     [
-        candidate(2, shift=(0, 0), east_m=40, score=0.1),  # it agrees by far less
-        candidate(2, shift=(0, 0), east_m=400),  # other ground
+        make_candidate(2, shift=(0, 0), east_m=40, score=0.1),  # it agrees by far less
+        make_candidate(2, shift=(0, 0), east_m=400),  # other ground
     ],
 )
 def test_locate_skips_places_of_other_ground(other):
-    found = locate([candidate(1, shift=(4, 0)), other], CELLS)
+    found = locate([make_candidate(1, shift=(4, 0)), other], CELLS)
     assert (found.places, found.objection) == ((1,), None)
 
 
 def test_locate_needs_a_pose_and_a_shift():
     bare = Place(place_id=1, source_image="1", position=ORIGIN)
-    assert locate([Candidate(bare, candidate().match)], CELLS) is None
-    assert locate([Candidate(candidate().place, FineMatch(0.5))], CELLS) is None
-    assert locate([candidate()], None) is None, "ahead, a step says nothing about metres"
+    assert locate([Candidate(bare, make_candidate().match)], CELLS) is None
+    assert locate([Candidate(make_candidate().place, FineMatch(0.5))], CELLS) is None
+    assert locate([make_candidate()], None) is None, "ahead, a step says nothing about metres"
     assert locate_at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
 
 
 def test_locate_rotates_the_covariance_of_the_place_to_the_ground():
-    found = locate([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(nadir_offset=(0.0, 0.0)))
+    found = locate([make_candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(nadir_offset=(0.0, 0.0)))
     var_east, cov, var_north = found.covariance_m2
     assert var_east > 100 > 10 > var_north > 1
     assert abs(cov) < 0.1

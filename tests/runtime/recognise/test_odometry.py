@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from levelled_views import light_ground, take_level_view
+from levelled_views import draw_ground, take_level_view
 
 from edgevpr.frames.level import UNKNOWN_VIEW
 from edgevpr.lab.simulate.camera import CameraPose
@@ -18,7 +18,7 @@ START = CameraPose(east_m=200.0, north_m=200.0, height_m=100.0, heading_deg=30.0
 
 @pytest.fixture(scope="module")
 def ground():
-    return light_ground(400.0, 400.0)
+    return draw_ground(400.0, 400.0)
 
 
 def take_view(ground, pose, told=None):

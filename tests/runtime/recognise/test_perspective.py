@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from levelled_views import light_ground, take_level_view
+from levelled_views import draw_ground, take_level_view
 from scipy.spatial.transform import Rotation
 
 from edgevpr.core.contract import Perspective
@@ -20,7 +20,9 @@ FOCAL = 0.77  # shares of the longest side: 66 degrees across
 SEEN = View(nadir_offset=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
 
 
-def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, noise=0.0, nadir_offset=(0.0, 0.0)):
+def make_landmarks(
+    count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, noise=0.0, nadir_offset=(0.0, 0.0)
+):
     """Points of a query whose camera rolls and pitches more than reported, and of the place seen straight from above:
     the nose is the top of the query, the top of the place north."""
     rng = np.random.default_rng(3)
@@ -37,7 +39,7 @@ def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, 
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(2.0, 0.0), (0.0, -3.0), (-1.0, 1.5)])
 def test_fit_attitude_error_moves_the_nadir_opposite_to_the_tilt(roll_deg, pitch_deg, turned_deg, scale):
     """Right wing down, the middle of the picture is to the left: the aircraft is right of it."""
-    asked, known = landmarks(roll_deg=roll_deg, pitch_deg=pitch_deg, turned_deg=turned_deg, scale=scale)
+    asked, known = make_landmarks(roll_deg=roll_deg, pitch_deg=pitch_deg, turned_deg=turned_deg, scale=scale)
     lean = fit_attitude_error(asked, known, SEEN, up_deg=turned_deg)
     along = math.tan(math.radians(roll_deg)) - 1j * math.tan(math.radians(pitch_deg))  # right, ahead
     east_north = along * np.exp(-1j * math.radians(turned_deg))
@@ -46,7 +48,7 @@ def test_fit_attitude_error_moves_the_nadir_opposite_to_the_tilt(roll_deg, pitch
 
 
 def test_fit_attitude_error_is_as_accurate_as_it_reports():
-    seen = (landmarks(roll_deg=2.0, noise=2 / 640, count=count) for count in (30, 60, 120, 240))
+    seen = (make_landmarks(roll_deg=2.0, noise=2 / 640, count=count) for count in (30, 60, 120, 240))
     told = [fit_attitude_error(*each, SEEN, 0.0) for each in seen]
     for lean in told:
         assert lean.nadir_shift[0] == pytest.approx(math.tan(math.radians(2.0)), abs=2 * lean.sd)
@@ -57,13 +59,13 @@ def test_fit_attitude_error_is_as_accurate_as_it_reports():
 def test_fit_attitude_error_accepts_a_nadir_away_from_the_centre():
     nadir_offset = (0.2, -0.1)
     view = View(nadir_offset=nadir_offset, focal=FOCAL)
-    lean = fit_attitude_error(*landmarks(roll_deg=2.0, nadir_offset=nadir_offset), view, 0.0)
+    lean = fit_attitude_error(*make_landmarks(roll_deg=2.0, nadir_offset=nadir_offset), view, 0.0)
     assert lean.nadir_shift == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
 
 
 def test_fit_attitude_error_ignores_a_slope_of_the_ground():
     """Seen from 15 m beside the place at 100 m, a slope of ten degrees shears the picture by some 3 %."""
-    asked, known = landmarks(count=60, noise=2 / 640)
+    asked, known = make_landmarks(count=60, noise=2 / 640)
     beside = asked.real > -0.1  # the pictures overlap on one side only
     sheared = (known + 0.03 * asked.conj())[beside]
     lean = fit_attitude_error(asked[beside], sheared, SEEN, 0.0)
@@ -72,11 +74,11 @@ def test_fit_attitude_error_ignores_a_slope_of_the_ground():
 
 @pytest.mark.parametrize("view", [View(), View(nadir_offset=(0.0, 0.0)), View(focal=FOCAL)])
 def test_fit_attitude_error_needs_attitude_and_lens(view):
-    assert fit_attitude_error(*landmarks(roll_deg=2.0), view, 0.0) is None
+    assert fit_attitude_error(*make_landmarks(roll_deg=2.0), view, 0.0) is None
 
 
 def test_fit_attitude_error_needs_enough_landmarks_off_a_line():
-    asked, known = landmarks(count=11)
+    asked, known = make_landmarks(count=11)
     assert fit_attitude_error(asked, known, SEEN, 0.0) is None
     line = np.linspace(-0.4, 0.4, 20) + 0j
     lean = fit_attitude_error(line, line, SEEN, 0.0)
@@ -85,7 +87,7 @@ def test_fit_attitude_error_needs_enough_landmarks_off_a_line():
 
 @pytest.fixture(scope="module")
 def ground():
-    return light_ground(320.0, 280.0)
+    return draw_ground(320.0, 280.0)
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ STEP_M = 0.6 * SPACING_M * STRIDE, 0.8 * SPACING_M * STRIDE
 SIMILAR_PLACES = 7  # places elsewhere that a look is a little like
 
 
-def point(place):
+def to_position(place):
     return Position(*offset_position(50.0, 8.0, 0.6 * SPACING_M * place, 0.8 * SPACING_M * place))
 
 
@@ -44,7 +44,7 @@ def make_index(positions):
 
 
 ORDER_INDEX = make_index([None] * PLACES)
-METRIC_INDEX = make_index([point(place) for place in range(PLACES)])
+METRIC_INDEX = make_index([to_position(place) for place in range(PLACES)])
 
 
 class Flight:
@@ -76,7 +76,9 @@ class Flight:
         where = None
         if self.has_poses:
             number = int(self.index.place_ids[best])
-            where = Located(position=point(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
+            where = Located(
+                position=to_position(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,)
+            )
         return self.follower.update(
             Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where
         )
@@ -105,8 +107,8 @@ def assert_sound(followed):
         assert 0 < followed.estimate.sd_m < np.inf
 
 
-def off_m(followed, place):
-    here, there = followed.estimate.position, point(place)
+def measure_off_m(followed, place):
+    here, there = followed.estimate.position, to_position(place)
     return distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
 
 
@@ -133,7 +135,7 @@ def make_bare_map(path, has_poses):
     place_map = PlaceMap.create(path, SPEC)
     for place in range(3):
         pose = Pose(up_deg=0.0, footprint_m=FOOTPRINT_M, covariance_m2=(4.0, 0.0, 4.0)) if has_poses else None
-        frame = Frame(image=BLANK, name=f"{place}", t_mono_s=0.0, position=point(place), pose=pose)
+        frame = Frame(image=BLANK, name=f"{place}", t_mono_s=0.0, position=to_position(place), pose=pose)
         place_map.add(frame, Descriptor(coarse=np.zeros(1, "<f4")))
     return place_map
 
@@ -160,19 +162,19 @@ def test_positions_are_those_of_the_places(posed_map, bare_map):
     posed, bare = Flight(posed_map, METRIC_INDEX), Flight(bare_map, METRIC_INDEX)
     for place in np.arange(10, 60, 2.5):
         found = posed.query(place)
-        assert off_m(found, place) < SPACING_M / 2
+        assert measure_off_m(found, place) < SPACING_M / 2
     assert found.estimate.sd_m < SPACING_M
     assert found.estimate.heading_deg == pytest.approx(350.0)
     assert found.mass > CERTAIN
     for place in range(10, 60, STRIDE):
         found = bare.query(place)
-        assert off_m(found, place) < SPACING_M
+        assert measure_off_m(found, place) < SPACING_M
     assert found.estimate.heading_deg is None
     assert found.estimate.sd_m > SPACING_M / 4, "a place says no better where the aircraft is than it is apart"
 
 
 def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(posed_map):
-    where = Located(position=point(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
+    where = Located(position=to_position(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
     slots = np.array([20, 40])
     ranking = Ranking(
         slots=slots, scores=np.array([0.3, 0.3], np.float32), compared={20: FineMatch(0.3), 40: FineMatch(0.3)}
@@ -207,7 +209,7 @@ def test_place_filter_keeps_only_the_last_pass_of_a_frame(flight):
 
 
 def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_map, bare_map):
-    some = make_index([None if place % 3 == 0 else point(place) for place in range(PLACES)])
+    some = make_index([None if place % 3 == 0 else to_position(place) for place in range(PLACES)])
     for place_map in (posed_map, bare_map):
         flight = Flight(place_map, some)
         flight.has_poses = False
@@ -219,7 +221,7 @@ def test_place_filter_gives_no_confidence_from_a_place_without_position(posed_ma
 
 def measure_displacement_m(places):
     """Metres east and north by so many places."""
-    return offset_between_m(point(0), point(places))
+    return offset_between_m(to_position(0), to_position(places))
 
 
 def fly_across_gap(place_map, moved_m, away=60, p=0.5):
@@ -237,7 +239,7 @@ def test_place_filter_confirms_a_doubtful_match_by_odometry(posed_map):
     _, seen = fly_across_gap(posed_map, measure_displacement_m(1))
     assert blind.confidence < 0.9  # of a match that is right half the time
     assert seen.confidence > 0.96
-    assert off_m(seen, 9) < SPACING_M
+    assert measure_off_m(seen, 9) < SPACING_M
 
 
 def test_place_filter_counts_failed_queries_over_the_same_ground_once(posed_map):
@@ -255,7 +257,7 @@ def test_place_filter_recovers_from_a_wrong_belief(posed_map, moved_m):
     found = [flight.query(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]
     assert found[-1].confidence >= 0.9
     assert found[-1].mass > CERTAIN
-    assert off_m(found[-1], 65) < SPACING_M
+    assert measure_off_m(found[-1], 65) < SPACING_M
 
 
 def test_place_filter_never_confirms_one_of_several_twins(posed_map):

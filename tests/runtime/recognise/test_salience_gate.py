@@ -36,13 +36,13 @@ class HalfMemorable:
         return np.repeat(np.array([[1.0, 1.0, 0.5, 0.0, 0.0]], np.float32), 5, axis=0)
 
 
-def texture(height=120, width=160, spread=40.0, middle=128.0):
+def draw_texture(height=120, width=160, spread=40.0, middle=128.0):
     fine = cv2.GaussianBlur(RNG.normal(0, 1, (height, width)), (0, 0), 1.5)
     return np.clip(middle + spread * fine / fine.std(), 0, 255).astype(np.uint8)
 
 
 def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_nothing():
-    picture = texture()
+    picture = draw_texture()
     static = np.ones(picture.shape, bool)
     static[:, 120:] = False
     scores = compute_scores(picture, HalfMemorable(), static)
@@ -77,7 +77,7 @@ def test_judge_scores_ignores_a_score_that_was_not_computed():
 
 
 def test_salience_gate_requires_less_entropy_in_bad_light():
-    day = [texture() for _ in range(40)]
+    day = [draw_texture() for _ in range(40)]
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
     by_day, at_night = SalienceGate(make_config(entropy=0.4)), SalienceGate(make_config(entropy=0.4))
     assert all(by_day.judge(picture).reason is None for picture in day)
@@ -88,7 +88,7 @@ def test_salience_gate_requires_less_entropy_in_bad_light():
 
 def test_salience_gate_halves_the_threshold_until_the_light_is_known():
     gate = SalienceGate(make_config(entropy=0.4))
-    little = texture()
+    little = draw_texture()
     while not 0.2 < compute_scores(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
     assert [gate.judge(little).reason for _ in range(4)] == [None] * 4
@@ -98,7 +98,7 @@ def test_salience_gate_halves_the_threshold_until_the_light_is_known():
 def test_salience_gate_does_not_adapt_to_a_long_stretch_without_information():
     gate = SalienceGate(make_config(entropy=0.4))
     for _ in range(30):
-        assert gate.judge(texture()).reason is None
+        assert gate.judge(draw_texture()).reason is None
     empty = np.full((120, 160), 77, np.uint8)
     assert all(gate.judge(empty).criterion == "entropy" for _ in range(70))
 
@@ -114,9 +114,9 @@ def test_salience_gate_runs_the_detector_on_every_kth_frame():
     detector = Counting()
     gate = SalienceGate(make_config(staticity=0.6, detect_every=4), detector=detector)
     for _ in range(9):
-        gate.judge(texture())
+        gate.judge(draw_texture())
     assert detector.looks == 3
-    gate.judge(texture(60, 80))  # of another size: what was found does not fit it
+    gate.judge(draw_texture(60, 80))  # of another size: what was found does not fit it
     assert detector.looks == 4
 
 

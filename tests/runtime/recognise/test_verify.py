@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from map_writer import write_sql
-from pictures_of_nothing import figures
+from pictures_of_nothing import overlay_figures
 from sureness import make_model, make_rule, rate_landmarks
 from walks import make_map, walk_over
 
@@ -131,7 +131,7 @@ def test_verify_refuses_a_place_whose_landmarks_and_regions_disagree(map_copy, t
 
 
 def draw_figures(image):
-    return figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
+    return overlay_figures(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.random.default_rng(3))
 
 
 def test_verify_detects_an_overlay_by_unshifted_matches_of_other_places(tmp_path, map_copy, technique):

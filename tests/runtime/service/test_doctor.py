@@ -276,7 +276,7 @@ def link() -> str:
     return f"udpin:127.0.0.1:{free_port()}"
 
 
-def peer(link: str, **autopilot) -> AnsweringAutopilot:
+def serve_peer(link: str, **autopilot) -> AnsweringAutopilot:
     return AnsweringAutopilot(parse_link(link).number, messages=healthy_messages(), **autopilot)
 
 
@@ -289,7 +289,7 @@ def parse_findings(printed: str) -> dict[str, bool]:
 @pytest.mark.usefixtures("_listen_briefly")
 def test_doctor_over_a_link_only_reads(link, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}) as autopilot:
+    with serve_peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}) as autopilot:
         code = main(["doctor", "--link", link])
     found = parse_findings(capsys.readouterr().out)
     assert [what for what, ok in found.items() if not ok] == []
@@ -320,7 +320,7 @@ def test_doctor_reads_the_configuration_and_prints_json(link, capsys, tmp_path):
 def test_doctor_waits_for_a_frame_of_the_camera(link, capsys, tmp_path):
     config = tmp_path / "config.yaml"
     config.write_text(f"source: {{uri: 'tcp://127.0.0.1:{free_port()}'}}\nlog: {{path: null}}\n")
-    with peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}):
+    with serve_peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}):
         assert main(["doctor", "--config", str(config), "--link", link]) == 1
     found = parse_findings(capsys.readouterr().out)
     assert [what for what, ok in found.items() if not ok] == ["frames"]

@@ -5,7 +5,7 @@ import shutil
 import tracemalloc
 
 import pytest
-from big_map import file_bytes, make_big_map
+from big_map import estimate_file_bytes, make_big_map
 from flight_process import finish_flight, start, watch_memory, write_frames
 
 from edgevpr.places.index import compute_place_bytes, load_index
@@ -27,7 +27,7 @@ def big_map(tmp_path_factory):
     """A map of cohog; forgotten with the last test, since it is large."""
     folder = tmp_path_factory.mktemp("memory")
     spec = create("cohog").spec
-    if shutil.disk_usage(folder).free < SPARE_BYTES + file_bytes(spec, PLACES):
+    if shutil.disk_usage(folder).free < SPARE_BYTES + estimate_file_bytes(spec, PLACES):
         pytest.skip(f"less than 1 GB is free in {folder}")
     make_big_map(folder / "big.gpkg", spec, PLACES)
     yield folder / "big.gpkg"

@@ -29,7 +29,7 @@ def verify(text: str, folder: Path) -> str:
     return done.stderr + ("" if done.returncode == 0 else f"exit code {done.returncode}")
 
 
-def directives(text: str) -> dict[str, str]:
+def read_directives(text: str) -> dict[str, str]:
     """The last value of each directive of a unit."""
     return dict(re.findall(r"(?m)^(\w+)=(.*)$", text))
 
@@ -57,7 +57,7 @@ def test_unit_keeps_its_exposure_under_two(tmp_path):
 
 def test_unit_requires_no_removable_storage():
     """systemd stops a service with the mount that it requires, and starts neither again."""
-    said = directives(UNIT.read_text())
+    said = read_directives(UNIT.read_text())
     requiring = {"WorkingDirectory", "StateDirectory", "LogsDirectory", "RequiresMountsFor", "Requires", "BindsTo"}
     assert not requiring & said.keys()
     folders = {path.removeprefix("-") for path in said["ReadWritePaths"].split()}
@@ -72,9 +72,9 @@ def test_unit_file_in_deploy_is_that_of_the_default_board():
 def test_render_unit_has_the_limits_of_the_board():
     board = replace(load_board("rpi-zero-2w"), name="mine", cores=8, cpu_share=0.3, memory_max_mb=777.0)
     unit = render_unit(board)
-    assert directives(unit)["MemoryMax"] == "777000000"
-    assert directives(unit)["CPUQuota"] == "240%"
-    assert directives(unit)["ExecStart"] == "/opt/edgevpr/bin/edgevpr run --config /etc/edgevpr/config.yaml"
+    assert read_directives(unit)["MemoryMax"] == "777000000"
+    assert read_directives(unit)["CPUQuota"] == "240%"
+    assert read_directives(unit)["ExecStart"] == "/opt/edgevpr/bin/edgevpr run --config /etc/edgevpr/config.yaml"
     assert "# Board: mine\n" in unit
     assert "rpi-zero-2w" not in unit
 
@@ -82,11 +82,11 @@ def test_render_unit_has_the_limits_of_the_board():
 def test_render_unit_escapes_the_name_of_the_board():
     unit = render_unit(replace(load_board("rpi-zero-2w"), name="x\nExecStartPre=/bin/sh"))
     assert "\n# Board: x\\nExecStartPre=/bin/sh\n" in unit
-    assert directives(unit)["ExecStartPre"] == directives(UNIT.read_text())["ExecStartPre"]
+    assert read_directives(unit)["ExecStartPre"] == read_directives(UNIT.read_text())["ExecStartPre"]
 
 
 def test_unit_finds_the_files_installed_by_the_documented_commands():
-    said, page = directives(UNIT.read_text()), (DEPLOY / "README.md").read_text()
+    said, page = read_directives(UNIT.read_text()), (DEPLOY / "README.md").read_text()
     commands = "".join(re.findall(r"(?ms)^```sh$(.*?)^```$", page))
     program, config = said["ExecStart"].split()[0], said["ExecStart"].split()[-1]
     assert f"venv {program.removesuffix('/bin/edgevpr')}\n" in commands
@@ -98,7 +98,7 @@ def test_unit_finds_the_files_installed_by_the_documented_commands():
 
 
 def test_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
-    unit = directives(UNIT.read_text())
+    unit = read_directives(UNIT.read_text())
     assert unit["Restart"] == "always"
     assert unit["StartLimitIntervalSec"] == "0"
     assert unit["RestartPreventExitStatus"] == str(UsageError.exit_code)
@@ -106,7 +106,7 @@ def test_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
 
 
 def test_unit_allows_serial_ports_and_cameras():
-    unit = directives(UNIT.read_text())
+    unit = read_directives(UNIT.read_text())
     # /dev/video*, /dev/media* and /run/udev, which libcamera and GStreamer read, are not hidden.
     hidden = {"PrivateDevices", "InaccessiblePaths", "TemporaryFileSystem", "RootDirectory", "MountAPIVFS"}
     assert not hidden & unit.keys()
