@@ -82,7 +82,7 @@ def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, caps
 @pytest.mark.parametrize(
     ("flags", "code", "said"),
     [
-        (["--images", "FLIGHT/other"], 2, "pictures of only 0 places were found"),
+        (["--images", "FLIGHT/other"], 2, " 0 places"),
         (["--images", "FLIGHT/absent"], 1, "does not exist"),
         ([], 2, "Pass either --images"),
         (["--images", "FLIGHT/ref", "--positions", "FLIGHT/absent.csv"], 2, "absent.csv"),

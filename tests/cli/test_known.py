@@ -64,10 +64,10 @@ def test_match_reports_the_hints_of_each_query(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("known", "places_known", "more", "said"),
     [
-        ("heading", True, (), "`heading` needs yaw_deg, but no query has it"),
-        ("height,reach", False, (), "`reach` needs lat and lon, but no place has it"),
-        ("height,speed", True, (), "`known` contains `speed`, but must be a list of heading, height, reach"),
-        ("height", True, ("--sequence", "2"), "2 queries are matched together"),
+        ("heading", True, (), "yaw_deg"),
+        ("height,reach", False, (), "`reach`"),
+        ("height,speed", True, (), "`speed`"),
+        ("height", True, ("--sequence", "2"), "2 queries"),
     ],
 )
 def test_eval_refuses_known_data_that_is_missing(capsys, tmp_path, known, places_known, more, said):

@@ -47,7 +47,8 @@ def test_open_recogniser_uses_the_form_of_the_configuration(flight):
     recogniser = open_recogniser(config, load_board("this"))
     assert recogniser.index.rows.shape == (6, 8)
     reason = explain_technique(recogniser, is_named=False)
-    assert reason.startswith("technique calc 1bit: the map was built with it; weights of tiny: A tiny network")
+    assert reason.startswith("technique calc 1bit: ")
+    assert "A tiny network" in reason
     recogniser.place_map.close()
     with pytest.raises(ConfigError, match=r"match\.form"):
         load_config(None, {"match.form": 1})

@@ -61,15 +61,15 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
 @pytest.mark.parametrize(
     ("flags", "code", "said"),
     [
-        ([], 2, "Pass either --images (pictures of a flight) or --orthophoto"),
-        (["--images", "x", "--footprint-m", "80"], 2, "--footprint-m applies only to --orthophoto: leave it out."),
+        ([], 2, "Pass either --images"),
+        (["--images", "x", "--footprint-m", "80"], 2, "--footprint-m applies"),
         (["--orthophoto", "GROUND"], 2, "needs --footprint-m"),
         (
             ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--camera", "forward"],
             2,
             "pass --camera nadir",
         ),
-        (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "nothing.tif does not exist"),
+        (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "nothing.tif"),
     ],
 )
 def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code, said):
@@ -81,15 +81,12 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--track", "t"], "--track applies only to --orthophoto"),
+        (["--track", "t"], "--track applies"),
         (["--orthophoto", "GROUND"], "needs --track"),
         (["--orthophoto", "GROUND", "--track", "TRACK"], "pass --height-m"),
-        (
-            ["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "0"],
-            "--height-m is 0, but must be between 1 and 10000.",
-        ),
-        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "no images were written"),
-        (["--fov-deg", "66"], "--fov-deg applies only to --orthophoto"),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "0"], "--height-m is 0"),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "no images"),
+        (["--fov-deg", "66"], "--fov-deg applies"),
     ],
 )
 def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys, flags, said):

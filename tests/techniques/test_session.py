@@ -35,11 +35,11 @@ def test_open_backbone_accepts_any_batch_size(models):
 @pytest.mark.parametrize(
     ("fault", "says"),
     [
-        ("no onnx", "cannot be opened as an ONNX model"),
-        ("weights outside", "cannot be opened as an ONNX model with embedded weights"),
+        ("no onnx", "an ONNX model"),
+        ("weights outside", "embedded weights"),
         ("other size", r"Got: 32 Expected: 40"),
-        ("nan", "not finite, or beyond .* for `features`"),
-        ("zeros", "outputs only zeros for `features`"),
+        ("nan", "finite.* `features`"),
+        ("zeros", "zeros .*`features`"),
     ],
 )
 def test_open_backbone_refuses_an_unsuitable_file_in_one_sentence(models, monkeypatch, fault, says):
@@ -57,14 +57,10 @@ def test_open_backbone_refuses_an_unsuitable_file_in_one_sentence(models, monkey
         ({"outputs": {"features": "conv5"}}, "features", "conv5"),
         ({"outputs": {"features": "descriptor"}}, "features", r"is \(1, 16\), but `features` must be \(1, C, H, W\)"),
         ({"outputs": {"descriptor": "features"}}, "descriptor", r"is \(1, 4, 10, 14\), but .* must be \(1, D\)"),
-        ({"outputs": {"features": "features"}}, "descriptor", "lists no output for `descriptor`"),
+        ({"outputs": {"features": "features"}}, "descriptor", "no output .*`descriptor`"),
         ({"input": {**CARD["input"], "colour": "rgb"}}, "features", r"Got: 3 Expected: 1"),
-        (
-            {"sha256": "0" * 64},
-            "features",
-            "does not match its card: its SHA-256 is [0-9a-f]{64}, but the card expects 0",
-        ),
-        ({"file": "gone.onnx"}, "features", "gone.onnx cannot be read"),
+        ({"sha256": "0" * 64}, "features", "SHA-256 .*[0-9a-f]{64}.* 0{64}"),
+        ({"file": "gone.onnx"}, "features", "gone.onnx"),
     ],
 )
 def test_open_backbone_refuses_a_card_that_does_not_fit_its_file_in_one_sentence(models, card, output, says):
@@ -121,8 +117,8 @@ def test_techniques_without_networks_need_no_onnxruntime(models):
     write_network(models)
     done = subprocess.run([sys.executable, "-c", FAULTY_CARDS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("onnxruntime cannot be imported (")
-    assert done.stdout.endswith("hog, cohog and seqslam work without it.\n")
+    assert done.stdout.startswith("onnxruntime ")
+    assert all(name in done.stdout for name in ("hog", "cohog", "seqslam"))
     assert done.stdout.count("\n") == 1
 
 

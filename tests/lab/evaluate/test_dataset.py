@@ -63,7 +63,7 @@ HEADER = "query_file,ref_files,status\n"
         (HEADER + "a.png,a.png,novel\n", ["truth.csv, line 2", "`a.png`", "`novel` but has ref_files"]),
         (HEADER + "a.png,a.png,ok\na.png,b.png,ok\n", ["truth.csv, line 3", "`a.png`", "keep one"]),
         (HEADER + "a.png,a.png\n", ["truth.csv, line 2", "fields"]),
-        (HEADER + "a.png,a.png,uncertain\n", ["truth.csv", "no query to score"]),
+        (HEADER + "a.png,a.png,uncertain\n", ["truth.csv", "no query"]),
         (b"\xff\xd8\xff\xe0 a JPEG", ["truth.csv", "not a UTF-8 CSV file"]),
     ],
 )

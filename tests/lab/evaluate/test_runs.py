@@ -44,7 +44,7 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
     ("argv", "said"),
     [
         ([], "--data"),
-        (["--data", "SET", "--ground-truth", "truth.csv"], "--ground-truth applies only to"),
+        (["--data", "SET", "--ground-truth", "truth.csv"], "--ground-truth applies"),
         (["--data", "gone"], "gone"),
         (["--data", "SET", "--techniques", "cohogg"], "cohogg"),
         (["--data", "SET", "--form", "2bit"], "2bit"),
