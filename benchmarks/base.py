@@ -23,8 +23,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path += [str(REPOSITORY / name) for name in ("tests", "tests/mavlink", "tests/runtime", "models/recipes")]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
-TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash", "thumbs_essex")
-FROM_THE_AIR = ("aerial_", "kite_", "sat_")  # how the names of such sets begin
+TUNING_SETS = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash", "thumbs_essex")
+AERIAL_PREFIXES = ("aerial_", "kite_", "sat_")  # how the names of such sets begin
 Row = dict[str, Any]
 
 
@@ -43,38 +43,38 @@ def run(main: Callable[[], object], opencv_threads: int | None = 1) -> None:
         sys.exit(error.exit_code)
 
 
-def made_by() -> Row:
+def describe_run() -> Row:
     """Return the date, the commit and the machine of a measurement."""
     versions = {"python": platform.python_version(), "numpy": np.__version__, "opencv": cv2.__version__}
     return {
         "date": provenance.format_date(),
-        "commit": commit(),
+        "commit": read_commit(),
         "machine": {**provenance.describe_machine(), **versions},
     }
 
 
 @cache
-def commit(repository: Path = REPOSITORY) -> str:
+def read_commit(repository: Path = REPOSITORY) -> str:
     """Return the commit of a repository that is measured, and whether something has changed since."""
     if not shutil.which("git"):
         return "unknown"
-    asked = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
-    of = ("git", "-C", str(repository))
-    head, changed = (subprocess.run([*of, *words], capture_output=True, text=True).stdout.strip() for words in asked)
+    commands = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
+    git = ("git", "-C", str(repository))
+    head, changed = (subprocess.run([*git, *args], capture_output=True, text=True).stdout.strip() for args in commands)
     return head + (" with changes" if changed else "") or "unknown"
 
 
-def program_commit(repository: Path) -> str:
+def read_program_commit(repository: Path) -> str:
     """Return what identifies the edgevpr of a repository: no other file changes it."""
-    asked = ("git", "-C", str(repository), "log", "-1", "--format=%h", "--", "edgevpr", "models")
-    last = subprocess.run(asked, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
-    return last + " with changes" * commit(repository).endswith("changes") or "unknown"
+    command = ("git", "-C", str(repository), "log", "-1", "--format=%h", "--", "edgevpr", "models")
+    last = subprocess.run(command, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
+    return last + " with changes" * read_commit(repository).endswith("changes") or "unknown"
 
 
 def read(name: str, folder: Path = RESULTS) -> Row:
     """Return the content of NAME.json; {} where it is not there."""
     path = folder / f"{name}.json"
-    return json.loads(path.read_text(), object_hook=from_columns) if path.exists() else {}
+    return json.loads(path.read_text(), object_hook=restore_rows) if path.exists() else {}
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -82,63 +82,64 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(handle))
 
 
-def write(name: str, found: Row, page: str, folder: Path = RESULTS) -> None:
+def write(name: str, content: Row, page: str, folder: Path = RESULTS) -> None:
     """Write NAME.json and NAME.md."""
-    write_json(name, found, folder)
+    write_json(name, content, folder)
     (folder / f"{name}.md").write_text(page.strip() + "\n")
 
 
-def write_json(name: str, found: Row, folder: Path = RESULTS) -> None:
+def write_json(name: str, content: Row, folder: Path = RESULTS) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(row_by_row(rounded(found), 0) + "\n")
+    (folder / f"{name}.json").write_text(format_json(round_floats(content), 0) + "\n")
 
 
-def row_by_row(value: Any, longest: int = 2000) -> str:
-    """Return JSON in which what is longer than so many characters has a line for each of its items; rows of the same
-    keys are kept as columns and rows."""
+def format_json(value: Any, longest: int = 2000) -> str:
+    """Return JSON with a line for each item of a value longer than `longest` characters; rows with the same keys become
+    columns and rows."""
     text = json.dumps(value)
     if not isinstance(value, dict | list) or len(text) <= longest:
         return text
     if isinstance(value, list) and all(isinstance(row, dict) and row.keys() == value[0].keys() for row in value):
         value = {"columns": list(value[0]), "rows": [[row[key] for key in value[0]] for row in value]}
     if isinstance(value, dict):
-        items = [f"{json.dumps(key)}: {row_by_row(each)}" for key, each in value.items()]
+        items = [f"{json.dumps(key)}: {format_json(item)}" for key, item in value.items()]
     else:
-        items = [row_by_row(each) for each in value]
+        items = [format_json(item) for item in value]
     first, last = "{}" if isinstance(value, dict) else "[]"
     return "\n".join((first, ",\n".join(items), last))
 
 
-def from_columns(value: Row) -> Any:
-    """Return what `row_by_row` has kept as columns and rows."""
+def restore_rows(value: Row) -> Any:
+    """Return what `format_json` has kept as columns and rows."""
     is_table = value.keys() == {"columns", "rows"}
     return [dict(zip(value["columns"], row, strict=True)) for row in value["rows"]] if is_table else value
 
 
-def rounded(value: Any) -> Any:
+def round_floats(value: Any) -> Any:
     """Return JSON content with at most six significant digits: no page shows more."""
     if isinstance(value, float):
         return float(f"{value:.6g}")
     if isinstance(value, Mapping):
-        return {key: rounded(each) for key, each in value.items()}
-    return [rounded(each) for each in value] if isinstance(value, list | tuple) else value
+        return {key: round_floats(item) for key, item in value.items()}
+    return [round_floats(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def made_line(found: Row, command: str) -> str:
+def format_origin(content: Row, command: str) -> str:
     """Return the sentence that ends a page."""
-    return f"Commit {found['commit']}, {found['date']}, {found['machine']['cpu']}. Made by `{command}`."
+    return f"Commit {content['commit']}, {content['date']}, {content['machine']['cpu']}. Made by `{command}`."
 
 
-def told(doc: str, until: str | None = None) -> str:
+def strip_title(doc: str, until: str | None = None) -> str:
     """Return the docstring of a script for its page: without its first line, and without what follows `until`."""
     text = doc.partition("\n\n")[2]
     return (text.partition(until)[0] if until else text).strip()
 
 
-def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], left: int = 1) -> str:
+def format_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], left: int = 1) -> str:
     """Return rows as a Markdown table. A column is its heading and a template such as "{error[median_m]:.1f}"; what a
     row lacks, or has as None, is "-"."""
-    return format_markdown_table(list(columns), [[cell(each, row) for each in columns.values()] for row in rows], left)
+    cells = [[format_cell(template, row) for template in columns.values()] for row in rows]
+    return format_markdown_table(list(columns), cells, left)
 
 
 def format_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
@@ -147,8 +148,8 @@ def format_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]
     return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
 
 
-def cell(template: str, row: Mapping[str, Any]) -> str:
-    """Fill in a template of `table`."""
+def format_cell(template: str, row: Mapping[str, Any]) -> str:
+    """Fill in a template of `format_table`."""
     try:
         text = template.format_map(row)
     except (KeyError, IndexError, TypeError):
@@ -156,71 +157,61 @@ def cell(template: str, row: Mapping[str, Any]) -> str:
     return "-" if "None" in text else text
 
 
-def use_of(name: str) -> str:
+def find_use(name: str) -> str:
     """Return whether parameters were chosen with a set (`tune`), or its figures are only reported (`report`)."""
-    return "tune" if name in TUNED_ON else "report"
+    return "tune" if name in TUNING_SETS else "report"
 
 
-def camera_of(name: str) -> str:
-    """Return the way the camera of a set looks."""
-    return "nadir" if name.startswith(FROM_THE_AIR) else "forward"
+def infer_camera(name: str) -> str:
+    """Return the direction of a set's camera, nadir or forward."""
+    return "nadir" if name.startswith(AERIAL_PREFIXES) else "forward"
 
 
 def find_sets(data: Path = DATA, names: Iterable[str] | None = None, camera: str | None = None) -> list[Path]:
     """Return the folders of `data` that have a ground truth: all, those named, or those of a camera. Raises UsageError
     where one is missing."""
-    found = {path.parent.name: path.parent for path in sorted(data.glob("*/ground_truth.csv"))}
-    wanted = list(found) if names is None else list(names)
-    missing = [name for name in wanted if name not in found]
-    if missing or not found:
+    folders = {path.parent.name: path.parent for path in sorted(data.glob("*/ground_truth.csv"))}
+    wanted = list(folders) if names is None else list(names)
+    missing = [name for name in wanted if name not in folders]
+    if missing or not folders:
         what = f"no set `{missing[0]}`" if missing else "no image sets (folders with a ground_truth.csv)"
         raise UsageError(f"There are {what} in {data}: name the right folder with EDGEVPR_DATA.")
-    return [folder for name, folder in found.items() if name in wanted and camera in (None, camera_of(name))]
+    return [folder for name, folder in folders.items() if name in wanted and camera in (None, infer_camera(name))]
 
 
-def edgevpr(*arguments: object) -> Any:
+def run_edgevpr(*arguments: object) -> Any:
     """Return what a command of edgevpr prints as JSON, by `--json`. Raises EdgevprError where it fails."""
     words = [sys.executable, "-m", "edgevpr", *map(str, arguments), "--json"]
-    done = subprocess.run(words, stdout=subprocess.PIPE, text=True)
-    if done.returncode:
+    process = subprocess.run(words, stdout=subprocess.PIPE, text=True)
+    if process.returncode:
         raise EdgevprError(f"`{' '.join(words[2:])}` failed (see above): correct what it names.")
-    return json.loads(done.stdout)
+    return json.loads(process.stdout)
 
 
-def figure(wide_in: float, high_in: float) -> Any:
-    """Make an empty figure of so many inches."""
+def make_panels(width_in: float, height_in: float, count: int, rows: int = 1, **shared: Any) -> tuple[Any, list[Any]]:
+    """Return a figure of so many inches with `count` panels in `rows`, each with a grid, and its axes."""
     from matplotlib.figure import Figure  # not every benchmark draws
 
-    return Figure(figsize=(wide_in, high_in), layout="constrained")
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    axes = list(figure.subplots(rows, -(-count // rows), squeeze=False, **shared).ravel())
+    for axis in axes[:count]:
+        axis.grid(alpha=0.3)
+        axis.tick_params(labelsize=8)
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return figure, axes[:count]
 
 
-def panels(wide_in: float, high_in: float, count: int, rows: int = 1, **shared: Any) -> tuple[Any, list[Any]]:
-    """Return a figure of so many inches with `count` panels in `rows`, each with a grid, and its axes."""
-    drawn = figure(wide_in, high_in)
-    axes = list(drawn.subplots(rows, -(-count // rows), squeeze=False, **shared).ravel())
-    for each in axes[:count]:
-        each.grid(alpha=0.3)
-        each.tick_params(labelsize=8)
-    for each in axes[count:]:
-        each.set_visible(False)
-    return drawn, axes[:count]
-
-
-def save(drawn: Any, path: Path, dpi: int = 80) -> None:
-    """Save a figure as a picture of few bytes."""
-    drawn.savefig(path, dpi=dpi)
-    shrink(path)
-
-
-def shrink(path: Path) -> None:
-    """Reduce a PNG to 64 colours."""
+def save_figure(figure: Any, path: Path, dpi: int = 80) -> None:
+    """Save a figure as a PNG of 64 colours."""
     from PIL import Image
 
+    figure.savefig(path, dpi=dpi)
     Image.open(path).convert("RGB").quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def kept(path: Path, measure: Callable[[], Any]) -> Any:
-    """Return what a file of `path` has; where it is not there, measure it and keep it: an interrupted run goes on."""
+def measure_once(path: Path, measure: Callable[[], Any]) -> Any:
+    """Return the content of the file `path`; if there is none, measure and write it, so an interrupted run resumes."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f"{path.name}.unfinished")
@@ -229,9 +220,15 @@ def kept(path: Path, measure: Callable[[], Any]) -> Any:
     return json.loads(path.read_text())
 
 
-def groups(rows: Iterable[Row], key: Callable[[Row], Any]) -> Iterator[tuple[Any, list[Row]]]:
-    """Yield rows by what `key` says of them, in the order of their first ones."""
-    found: dict[Any, list[Row]] = {}
+def group_rows(rows: Iterable[Row], key: Callable[[Row], Any]) -> Iterator[tuple[Any, list[Row]]]:
+    """Yield the rows of each value of `key`, in the order of first rows."""
+    groups: dict[Any, list[Row]] = {}
     for row in rows:
-        found.setdefault(key(row), []).append(row)
-    yield from found.items()
+        groups.setdefault(key(row), []).append(row)
+    yield from groups.items()
+
+
+def thin_evenly(items: Sequence[Any], count: int) -> list[Any]:
+    """Return at most `count` of the items, evenly spread."""
+    numbers = np.linspace(0, len(items) - 1, min(len(items), count)).round().astype(int)
+    return [items[number] for number in np.unique(numbers)]

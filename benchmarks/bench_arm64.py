@@ -31,7 +31,7 @@ TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
 WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
 RELEASE = "bookworm"  # glibc 2.36, Python 3.11: that of Raspberry Pi OS 12
 PYTHON = "3.11"
-CPU = "cortex-a53"  # an instruction that a Raspberry Pi 3 or Zero 2 W has not ends the program
+EMULATED_CPU = "cortex-a53"  # an instruction that a Raspberry Pi 3 or Zero 2 W has not ends the program
 # As Linux tells it of a Raspberry Pi Zero 2 W.
 _CPUINFO = """\
 processor\t: {}
@@ -57,47 +57,48 @@ def main() -> None:
         sys.exit(f"bench_arm64: as root, install qemu-user, debootstrap and gcc ({' '.join(missing)} is not there).")
     with TemporaryDirectory(prefix="edgevpr-arm64-") as folder:
         work = Path(folder)
-        build(work)
+        build_tools(work)
         maps = [str(work / f"{camera}.gpkg") for camera in ("forward", "nadir")]
         for path in maps:
-            make_big_map(Path(path), create("cohog", {"camera": Path(path).stem}).spec, counted.LARGE)
-        rows = count(work, maps)
-    found = {**base.made_by(), "parts": rows}
-    figures = counted.figures({row["part"]: row["instructions"] for row in rows})
+            make_big_map(Path(path), create("cohog", {"camera": Path(path).stem}).spec, counted.LARGE_MAP_PLACES)
+        rows = count_instructions(work, maps)
+    result = {**base.describe_run(), "parts": rows}
+    figures = counted.compute_counts({row["part"]: row["instructions"] for row in rows})
     COUNTED_PATH.write_text(json.dumps(figures, indent=1) + "\n")
-    base.write("arm64", found, page(found))
+    base.write("arm64", result, format_page(result))
 
 
-def build(work: Path) -> None:
+def build_tools(work: Path) -> None:
     """Make a Debian system for aarch64 with Python, the wheels that edgevpr imports, and the plug-in that counts."""
     make_system(work / "system")
-    names = [*(f"manylinux_{each}" for each in _GLIBC), "manylinux2014"]
+    names = [*(f"manylinux_{version}" for version in _GLIBC), "manylinux2014"]
     tags = ["--only-binary=:all:", "--implementation=cp", f"--python-version={PYTHON}"]
     tags += [f"--platform={name}_aarch64" for name in names]
     wheels = [f"{name}=={metadata.version(name)}" for name in WHEELS]
-    run([sys.executable, "-m", "pip", "install", "--quiet", f"--target={work / 'site'}", "--no-deps", *tags, *wheels])
-    run(["gcc", "-shared", "-fPIC", "-O2", "-o", str(work / "count.so"), str(HERE / "arm64" / "count.c")])
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", f"--target={work / 'site'}", "--no-deps"]
+    run_command([*pip, *tags, *wheels])
+    run_command(["gcc", "-shared", "-fPIC", "-O2", "-o", str(work / "count.so"), str(HERE / "arm64" / "count.c")])
 
 
 def make_system(folder: Path) -> None:
     """Make a Debian system for aarch64 with Python in a new folder, from Debian's packages; needs root for that."""
     packages = "python3,libsqlite3-0,libstdc++6"
-    run(
+    run_command(
         ["debootstrap", "--foreign", "--arch=arm64", "--variant=minbase", f"--include={packages}", RELEASE, str(folder)]
     )
     for archive in sorted((folder / "var/cache/apt/archives").glob("*.deb")):
-        run(["dpkg-deb", "-x", str(archive), str(folder)])
+        run_command(["dpkg-deb", "-x", str(archive), str(folder)])
         archive.unlink()
     # QEMU looks for every path here first: devices and settings are to be this machine's.
-    for each in folder.iterdir():
-        if each.name not in ("usr", "lib", "bin", "sbin"):
-            shutil.rmtree(each)
+    for path in folder.iterdir():
+        if path.name not in ("usr", "lib", "bin", "sbin"):
+            shutil.rmtree(path)
     # Libraries look here for what the processor can do: not that of this machine.
     (folder / "proc").mkdir()
     (folder / "proc/cpuinfo").write_text("\n".join(_CPUINFO.format(number) for number in range(4)))
 
 
-def run(argv: Sequence[str], env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:
+def run_command(argv: Sequence[str], env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:
     """Run a command, with `env` beside the variables of this process; one that fails ends the program with its
     output."""
     done = subprocess.run(argv, capture_output=True, text=True, env={**os.environ, **(env or {})})
@@ -106,32 +107,33 @@ def run(argv: Sequence[str], env: Mapping[str, str] | None = None) -> subprocess
     return done
 
 
-def count(work: Path, maps: list[str]) -> list[dict[str, Any]]:
+def count_instructions(work: Path, maps: list[str]) -> list[dict[str, Any]]:
     """Run the parts under emulation. Returns for each its name (`part`) and its `instructions`."""
-    argv = ["qemu-aarch64", "-cpu", CPU, "-L", str(work / "system"), "-plugin", str(work / "count.so")]
+    argv = ["qemu-aarch64", "-cpu", EMULATED_CPU, "-L", str(work / "system"), "-plugin", str(work / "count.so")]
     argv += [str(work / f"system/usr/bin/python{PYTHON}"), str(HERE / "arm64" / "work.py"), *maps]
-    done = run(argv, {"PYTHONPATH": f"{work / 'site'}:{HERE.parent}"})
+    done = run_command(argv, {"PYTHONPATH": f"{work / 'site'}:{HERE.parent}"})
     marks = [int(line) for line in done.stderr.splitlines() if line.isdigit()]
     names = done.stdout.splitlines()
     if len(marks) != 2 * len(names):
         raise RuntimeError(f"{len(marks)} marks of {len(names)} parts: {done.stderr}")
-    counted_of = zip(names, marks[::2], marks[1::2], strict=True)
-    return [{"part": name, "instructions": after - before} for name, before, after in counted_of]
+    parts = zip(names, marks[::2], marks[1::2], strict=True)
+    return [{"part": name, "instructions": after - before} for name, before, after in parts]
 
 
-def page(found: dict[str, Any]) -> str:
+def format_page(result: dict[str, Any]) -> str:
     """Return the page for people."""
-    machine, mips = found["machine"], load_board("rpi-zero-2w").benchmark_score.arm64_mips
-    millions = {row["part"]: row["instructions"] / 1e6 for row in found["parts"]}
-    rows = [{"part": part, "millions": each, "zero_s": each / mips} for part, each in millions.items()]
+    machine, places = result["machine"], counted.LARGE_MAP_PLACES
+    mips = load_board("rpi-zero-2w").benchmark_score.arm64_mips
+    millions = {row["part"]: row["instructions"] / 1e6 for row in result["parts"]}
+    rows = [{"part": part, "millions": count, "zero_s": count / mips} for part, count in millions.items()]
     return f"""# What a query costs an ARM core
 
-Made by `make bench-arm64` on {found["date"]}, commit {found["commit"]}: {counted.LARGE} places, and a picture in which
+Made by `make bench-arm64` on {result["date"]}, commit {result["commit"]}: {places} places, and a picture in which
 nearly every region is good. Counted while QEMU ran a Cortex-A53, with NumPy {machine["numpy"]} and OpenCV
 {machine["opencv"]} for aarch64. The last column divides by the {mips:g} million instructions a second of
 `profiles/rpi-zero-2w.yaml`.
 
-{base.table(rows, _COLUMNS)}
+{base.format_table(rows, _COLUMNS)}
 """
 
 

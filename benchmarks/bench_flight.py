@@ -23,116 +23,116 @@ from edgevpr.techniques import create
 PLACES = 10_000
 FRAMES = 60
 STARTS = 5
-IDLE_S = 10.0
-SETTLE_S = 2.0
-NOBODY = "rtsp://127.0.0.1:9/nobody"
-FLAGS = ["--link", "udpout:127.0.0.1:9"]
-MATCH = "import cv2, edgevpr, pathlib, sys; opened = edgevpr.Map(sys.argv[1])"
-MATCH += "; [opened.match(cv2.imread(str(each))) for each in pathlib.Path(sys.argv[2]).iterdir()]"
-NEVER_IMPORTED = ["onnxruntime", "matplotlib"]
+IDLE_DURATION_S = 10.0
+SETTLE_DURATION_S = 2.0
+DEAD_STREAM_URI = "rtsp://127.0.0.1:9/nobody"
+LINK_FLAGS = ["--link", "udpout:127.0.0.1:9"]
+MATCH_SCRIPT = "import cv2, edgevpr, pathlib, sys; opened = edgevpr.Map(sys.argv[1])"
+MATCH_SCRIPT += "; [opened.match(cv2.imread(str(each))) for each in pathlib.Path(sys.argv[2]).iterdir()]"
+FORBIDDEN_LIBRARIES = ["onnxruntime", "matplotlib"]
 
 
-def row_of(what: str, value: float, unit: str, target: float | None) -> Row:
+def make_row(what: str, value: float, unit: str, target: float | None) -> Row:
     """Return one line of the table; `target` is the most that `value` may be, None where none was set."""
     return {"what": what, "value": value, "unit": unit, "target": target}
 
 
-def rows() -> list[Row]:
+def measure_flight() -> list[Row]:
     """Make the map in a temporary folder, fly, look."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         place_map, frames = folder / "big.gpkg", folder / "frames"
         make_big_map(place_map, create("cohog").spec, PLACES)
         write_frames(frames, FRAMES)
-        start_s(place_map, frames, folder)  # compiles the bytecode, and fills the page cache
+        measure_start_s(place_map, frames, folder)  # compiles the bytecode, and fills the page cache
         return [
-            *memory_rows(place_map, frames, folder),
-            *start_rows(place_map, frames, folder),
-            *idle_rows(place_map, frames, folder),
-            library_row(place_map, frames),
+            *measure_memory(place_map, frames, folder),
+            *measure_starts(place_map, frames, folder),
+            *measure_idle_cpu(place_map, frames, folder),
+            measure_library_cpu(place_map, frames),
         ]
 
 
-def memory_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
+def measure_memory(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """The most that a flight of `FRAMES` queries takes."""
-    flight = start(place_map, frames, folder / "memory.jsonl", *FLAGS, "--rate-hz", "10")
+    flight = start(place_map, frames, folder / "memory.jsonl", *LINK_FLAGS, "--rate-hz", "10")
     largest, mapped = watch_memory(flight)
-    assert finished(flight) == 0
-    for name in NEVER_IMPORTED:
+    assert wait_for_exit(flight) == 0
+    for name in FORBIDDEN_LIBRARIES:
         assert name not in mapped, f"{name} was imported"
     return [
-        row_of("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
-        row_of("... without libraries (RssAnon)", largest["RssAnon"], "MB", None),
+        make_row("peak RSS (VmHWM)", largest["VmHWM"], "MB", 130.0),
+        make_row("... without libraries (RssAnon)", largest["RssAnon"], "MB", None),
     ]
 
 
-def start_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
+def measure_starts(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """From the start of the process to the first answer in its log, median of `STARTS`."""
-    warm_s = [start_s(place_map, frames, folder) for _ in range(STARTS)]
+    warm_s = [measure_start_s(place_map, frames, folder) for _ in range(STARTS)]
     cold_s = []
     for _ in range(STARTS):
-        forget_pages(place_map)
-        cold_s.append(start_s(place_map, frames, folder))
+        drop_cached_pages(place_map)
+        cold_s.append(measure_start_s(place_map, frames, folder))
     return [
-        row_of("start to first match", statistics.median(warm_s), "s", 2.0),
-        row_of("... with the map not in the page cache", statistics.median(cold_s), "s", 2.0),
+        make_row("start to first match", statistics.median(warm_s), "s", 2.0),
+        make_row("... with the map not in the page cache", statistics.median(cold_s), "s", 2.0),
     ]
 
 
-def idle_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
+def measure_idle_cpu(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """CPU-seconds a second without frames, in percent of one core."""
-    absent = idle_share(place_map, NOBODY, folder / "absent.jsonl", until="start")
-    waiting = idle_share(place_map, frames, folder / "waiting.jsonl", "--rate-hz", "0.01", until="query")
+    absent = measure_idle_share(place_map, DEAD_STREAM_URI, folder / "absent.jsonl", until="start")
+    waiting = measure_idle_share(place_map, frames, folder / "waiting.jsonl", "--rate-hz", "0.01", until="query")
     return [
-        row_of("idle CPU, stream not there", 100 * absent, "% of a core", 2.0),
-        row_of("idle CPU, between two frames", 100 * waiting, "% of a core", 2.0),
+        make_row("idle CPU, stream not there", 100 * absent, "% of a core", 2.0),
+        make_row("idle CPU, between two frames", 100 * waiting, "% of a core", 2.0),
     ]
 
 
-def library_row(place_map: Path, frames: Path) -> Row:
+def measure_library_cpu(place_map: Path, frames: Path) -> Row:
     """Processor time of the Python interface over that with one thread of NumPy's library, as the command line has."""
     free = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
     used_s = []
     for environment in (free, free | {"OPENBLAS_NUM_THREADS": "1"}):
         before_s = sum(os.times()[2:4])  # user and system time of child processes
-        subprocess.run([sys.executable, "-c", MATCH, place_map, frames], check=True, env=environment)
+        subprocess.run([sys.executable, "-c", MATCH_SCRIPT, place_map, frames], check=True, env=environment)
         used_s.append(sum(os.times()[2:4]) - before_s)
-    return row_of("processor time of edgevpr.Map, beside one thread", used_s[0] / used_s[1], "times", 1.2)
+    return make_row("processor time of edgevpr.Map, beside one thread", used_s[0] / used_s[1], "times", 1.2)
 
 
-def start_s(place_map: Path, frames: Path, folder: Path) -> float:
+def measure_start_s(place_map: Path, frames: Path, folder: Path) -> float:
     log = folder / "start.jsonl"
     log.unlink(missing_ok=True)
     begin_s = time.monotonic()
-    flight = start(place_map, frames, log, *FLAGS)
+    flight = start(place_map, frames, log, *LINK_FLAGS)
     answer = wait_for("query", log, flight)
     flight.terminate()
-    assert finished(flight) == 0
+    assert wait_for_exit(flight) == 0
     return answer["t_mono_s"] - begin_s  # one clock for all processes
 
 
-def idle_share(place_map: Path, source: Path | str, log: Path, *flags: str, until: str) -> float:
-    flight = start(place_map, source, log, *FLAGS, *flags)
+def measure_idle_share(place_map: Path, source: Path | str, log: Path, *flags: str, until: str) -> float:
+    flight = start(place_map, source, log, *LINK_FLAGS, *flags)
     wait_for(until, log, flight)
-    time.sleep(SETTLE_S)
+    time.sleep(SETTLE_DURATION_S)
     before_s, begin_s = read_cpu_s(flight.pid), time.monotonic()
-    time.sleep(IDLE_S)
+    time.sleep(IDLE_DURATION_S)
     share = (read_cpu_s(flight.pid) - before_s) / (time.monotonic() - begin_s)
     flight.terminate()
-    assert finished(flight) == 0
+    assert wait_for_exit(flight) == 0
     return share
 
 
-def forget_pages(path: Path) -> None:
+def drop_cached_pages(path: Path) -> None:
     """Let the kernel drop what it holds of a file."""
     with open(path, "rb") as file:
         os.fsync(file.fileno())
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def finished(flight: subprocess.Popen) -> int:
+def wait_for_exit(flight: subprocess.Popen) -> int:
     """Return the exit code; what a flight that failed has said goes to standard error."""
-    said = flight.communicate(timeout=60)[1]
+    errors = flight.communicate(timeout=60)[1]
     if flight.returncode:
-        print(said, file=sys.stderr)
+        print(errors, file=sys.stderr)
     return flight.returncode

@@ -24,8 +24,8 @@ from edgevpr.runtime.recognise.judge import make_accept_rule
 
 # Sets of the same ground are one site.
 SITES = {"grief_stromovka_monthly": "stromovka", "grief_stromovka_seasons": "stromovka"}
-LIKE = {"train_ie_tower": (12, "images")}  # no truth: every twelfth picture, as a foreign query only
-THINNED = {"nordland_tiny": 5}  # of 994 foreign queries every fifth
+FOREIGN_ONLY_SETS = {"train_ie_tower": (12, "images")}  # no truth: every twelfth picture, as a foreign query only
+FOREIGN_QUERY_STEPS = {"nordland_tiny": 5}  # of 994 foreign queries every fifth
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,41 +44,34 @@ class Row:
     veto: ReasonCode | None = None
 
 
-def site_of(name: str) -> str:
+def find_site(name: str) -> str:
     return SITES.get(name, name)
 
 
-def queries_of(name: str, is_own: bool) -> list[Path]:
-    step, folder = LIKE.get(name, (1, "query"))
-    return list_images(DATA / name / folder)[:: step if is_own else step * THINNED.get(name, 1)]
+def list_query_images(name: str, is_own: bool) -> list[Path]:
+    step, folder = FOREIGN_ONLY_SETS.get(name, (1, "query"))
+    return list_images(DATA / name / folder)[:: step if is_own else step * FOREIGN_QUERY_STEPS.get(name, 1)]
 
 
-def rows_of(name: str) -> Iterator[Row]:
-    """Ask the map of one set everything."""
-    with tempfile.TemporaryDirectory() as work:
-        is_placed = (DATA / name / "sites.csv").exists()
-        yield from _rows(name, run_sets.placed(DATA / name, Path(work)) if is_placed else DATA / name)
-
-
-def _rows(name: str, folder: Path) -> Iterator[Row]:
+def yield_rows(name: str, folder: Path) -> Iterator[Row]:
     """Ask the map of the set `name`, which lies in `folder`."""
-    dataset = walks.dataset_of(folder)
+    dataset = walks.load_matched_set(folder)
     scored = {query.path.name: query for query in dataset.queries}
     with walks.make_map(folder, images=folder / "ref") as (place_map, index, technique):
-        rule = make_accept_rule(technique, walks.config().match)
+        rule = make_accept_rule(technique, walks.make_config().match)
         rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))  # only objections refuse
-        walk = walks.walk(place_map, index, technique, rule=rule, all_evidence=True)
-        for other in [each.name for each in base.find_sets()] + list(LIKE):
-            if other != name and site_of(other) == site_of(name):
+        walk = walks.make_walk(place_map, index, technique, rule=rule, all_evidence=True)
+        for other in [set_folder.name for set_folder in base.find_sets()] + list(FOREIGN_ONLY_SETS):
+            if other != name and find_site(other) == find_site(name):
                 continue
-            for path in queries_of(other, other == name):
+            for path in list_query_images(other, other == name):
                 if other == name and path.name not in scored:
                     continue
-                event = walk.step(walks.frame(path))
+                event = walk.step(walks.make_frame(path))
                 if event.evidence is None:
                     continue
-                found, query = event.best.place.source_image, scored.get(path.name) if other == name else None
-                kind = kind_of_match(found, query, dataset.references, index)
+                image, query = event.best.place.source_image, scored.get(path.name) if other == name else None
+                kind = classify_match(image, query, dataset.references, index)
                 if kind == "ignored":
                     continue
                 refused = not event.accepted and event.confidence >= rule.confidence_rule.threshold(event.evidence)
@@ -95,36 +88,39 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
                 )
         if technique.spec.looks_down and np.isnan(index.lat_deg).any():
             return  # such a map is not calibrated
-        frames = list(walks.frames_of(folder / "ref"))
+        frames = list(walks.read_folder_frames(folder / "ref"))
         order = np.random.default_rng(15).permutation(len(frames))
-        frames = [frames[at] for at in np.resize(order, min(count_queries(technique), 6 * len(frames)))]
+        frames = [frames[number] for number in np.resize(order, min(count_queries(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.read_places()}
         pictures = ((ids[frame.name], LevelledImage(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
-        for answer in query_map(technique, place_map, index, rule, walks.meter(), pictures):
+        for answer in query_map(technique, place_map, index, rule, walks.make_meter(), pictures):
             if answer.evidence is not None:
-                told = {"kind": answer.way, "right": answer.right, "evidence": answer.evidence}
-                yield Row(map=name, set=name, query=str(answer.place_id), near=False, score=0.0, **told)
+                fields = {"kind": answer.way, "right": answer.right, "evidence": answer.evidence}
+                yield Row(map=name, set=name, query=str(answer.place_id), near=False, score=0.0, **fields)
 
 
-def kind_of_match(found: str, query: ScoredQuery | None, references: Sequence[str], index: PlaceIndex) -> str:
+def classify_match(image: str, query: ScoredQuery | None, references: Sequence[str], index: PlaceIndex) -> str:
     """Return what a best place is to a query (None: one of another site): right, ignored, beside a right one, wrong, or
     foreign."""
     if query is None:
         return "foreign"
-    if found in query.correct:
+    if image in query.correct:
         return "right"
-    if found in query.ignored:
+    if image in query.ignored:
         return "ignored"
-    known = np.flatnonzero([each in query.correct or each in query.ignored for each in references])
-    return "wrong" if outside_neighbourhood(index, references.index(found), known, 0.0).all() else "beside"
+    right_slots = np.flatnonzero([name in query.correct or name in query.ignored for name in references])
+    return "wrong" if outside_neighbourhood(index, references.index(image), right_slots, 0.0).all() else "beside"
 
 
-def gather(work: Path, name: str) -> None:
+def gather_rows(work: Path, name: str) -> None:
     """Write the rows of the map of a set, unless they are there already."""
     path = work / f"{name}.pkl"
     if not path.exists():
         work.mkdir(parents=True, exist_ok=True)
-        rows = list(rows_of(name))
+        with tempfile.TemporaryDirectory() as placed:
+            has_sites = (DATA / name / "sites.csv").exists()
+            folder = run_sets.place_sites(DATA / name, Path(placed)) if has_sites else DATA / name
+            rows = list(yield_rows(name, folder))
         path.with_suffix(".new").write_bytes(pickle.dumps(rows))
         path.with_suffix(".new").replace(path)
         print(name, len(rows), flush=True)

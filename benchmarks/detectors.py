@@ -7,8 +7,9 @@ from pathlib import Path
 
 from edgevpr.techniques.session import hash_model_file
 
-FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
 NAME = "yolox_nano"
+FOLDER = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
+FILE = FOLDER / NAME / "model.onnx"
 # Of the eighty classes of COCO those that move (thesis 3.2.2), with their numbers.
 _DYNAMIC = {
     "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
@@ -23,19 +24,13 @@ _CARD = {
 }
 
 
-def is_there() -> bool:
-    """Tell whether the file of the detector is on this machine."""
-    return (FILES / NAME / "model.onnx").is_file()
-
-
 def write_card(folder: Path) -> None:
     """Put the detector and its card into a folder of models."""
-    file = FILES / NAME / "model.onnx"
-    (folder / f"{NAME}.onnx").symlink_to(file.resolve())
+    (folder / f"{NAME}.onnx").symlink_to(FILE.resolve())
     card = {
         "title": NAME,
         "file": f"{NAME}.onnx",
-        "sha256": hash_model_file(file),
+        "sha256": hash_model_file(FILE),
         "licence": "see the file's own",
         "source": "an ONNX file beside the project",
         **_CARD,

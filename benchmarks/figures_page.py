@@ -9,44 +9,45 @@ import base
 import sets_page
 from base import REPOSITORY, RESULTS, format_markdown_table
 
-BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
+BEGIN_MARKER = "<!-- figures: made by benchmarks/figures_page.py -->\n"
+END_MARKER = "<!-- end of figures -->"
 
 
 def main() -> None:
     contents = sets_page.read_sets(RESULTS)
-    put(REPOSITORY / "docs" / "figures.md", f"{recall(contents)}\n\n{speed()}")
+    replace_figures(REPOSITORY / "docs" / "figures.md", f"{format_recall(contents)}\n\n{format_speed()}")
 
 
-def put(page: Path, figures: str) -> None:
+def replace_figures(page: Path, figures: str) -> None:
     """Put figures between the markers of a page."""
-    before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN)
-    _, _, after = rest.partition(END)
-    page.write_text(f"{before}{BEGIN}\n{figures}\n\n{END}{after}", encoding="utf-8")
+    before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN_MARKER)
+    _, _, after = rest.partition(END_MARKER)
+    page.write_text(f"{before}{BEGIN_MARKER}\n{figures}\n\n{END_MARKER}{after}", encoding="utf-8")
 
 
-def recall(contents: list[dict[str, Any]]) -> str:
+def format_recall(contents: list[dict[str, Any]]) -> str:
     """Recall@1 of every technique on every set, then that of the forms, and what the rule of the flight let through."""
     weights = {row["weights"] for content in contents for row in content["techniques"].values() if row["weights"]}
     by_flight = []
     for content in contents:
         name = "cohog" if "cohog" in content["techniques"] else "hog"
-        said = "* {set}: `{name}`, {accepted} of {queries}, {accepted_wrong} wrong"
+        line = "* {set}: `{name}`, {accepted} of {queries}, {accepted_wrong} wrong"
         if content["techniques"][name]["queries_off_map"]:
-            said += "; {accepted_off_map} of the {queries_off_map} off the map"
-        by_flight.append(said.format(set=content["set"], name=name, **content["techniques"][name]))
+            line += "; {accepted_off_map} of the {queries_off_map} off the map"
+        by_flight.append(line.format(set=content["set"], name=name, **content["techniques"][name]))
     return (
         "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries whose place is in the map after "
         "the use of a set):\n\n"
-        f"{sets_page.overview(contents, lambda label: not label.endswith(sets_page.FORMS))}\n\n"
+        f"{sets_page.format_recall_table(contents, lambda label: not label.endswith(sets_page.FORM_SUFFIXES))}\n\n"
         "The same vectors less the map's mean, a byte or a bit a number:\n\n"
-        f"{sets_page.overview(contents, lambda label: label.endswith(sets_page.FORMS))}\n\n"
+        f"{sets_page.format_recall_table(contents, lambda label: label.endswith(sets_page.FORM_SUFFIXES))}\n\n"
         f"Weights in use: {'; '.join(sorted(weights))}.\n\n"
         f"![Precision-recall curves of all techniques on all sets](../benchmarks/results/{sets_page.CURVES})\n\n"
         "Accepted as the place by the rule of the flight:\n\n" + "\n".join(by_flight)
     )
 
 
-def speed() -> str:
+def format_speed() -> str:
     """The figures of `make bench` that a builder asks for."""
     content = base.read("bench")
     machine = content["machine"]

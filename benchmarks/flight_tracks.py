@@ -17,8 +17,10 @@ from edgevpr.lab.simulate.generated import make_oscillation
 from edgevpr.lab.simulate.overflight import photograph_ground
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
+Rng = np.random.Generator
+
 QUERIES = 40
-ON_THE_WAY = (
+ROUTE_KINDS = (
     "along",
     "half speed",
     "double speed",
@@ -29,65 +31,73 @@ ON_THE_WAY = (
     "jump",
     "leave",
 )
-KINDS = (*ON_THE_WAY, "across", "foreign")
+KINDS = (*ROUTE_KINDS, "across", "foreign")
 # What is wrong with the odometry from a third of the flight on, or, where it is missing, from its beginning.
 ODOMETRY = ("good", "good", "stops", "good", "doubles", "good", "halves", "missing", "good", "not a number")
-_CRUISE_M_S, _FASTEST_M_S, _INTERVAL_S = 10.0, 25.0, (1.0, 6.0)
-_BIAS_M_S, _NOISE_M_S, _SCALE_SD, _HEADING_SD_DEG = 0.5, 0.3, 0.05, 5.0
-_ASIDE = 0.12  # footprints beside the mapped way
+_CRUISE_SPEED_M_S = 10.0
+_MAX_SPEED_M_S = 25.0
+_QUERY_INTERVALS_S = (1.0, 6.0)  # the least and the most
+_VELOCITY_BIAS_M_S = 0.5
+_VELOCITY_NOISE_M_S = 0.3
+_VELOCITY_SCALE_SD = 0.05
+_HEADING_SD_DEG = 5.0
+_ROUTE_OFFSET = 0.12  # footprints beside the mapped way
 _SWAY_DEG = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """One flight, a row a query: `t_s`; where the aircraft is, `at` (N, 2), with `heading_deg` and `footprints_m`
-    (ground along the longest side of a picture); what is under it, `over` (N,), the name of a site; and where in the
-    metres of that site, `seen` (N, 2). `jumped`: it was carried there since the query before, and no odometry tells."""
+    """One flight, a row a query: `t_s`; `position_m` (N, 2) of the aircraft, with `heading_deg` and `footprints_m`
+    (ground along the longest side of a picture); `site_names` (N,) of the ground under it, and `ground_m` (N, 2), its
+    position in the metres of that site. `is_jump`: it was carried there since the query before, without odometry."""
 
     t_s: np.ndarray
-    at: np.ndarray
+    position_m: np.ndarray
     heading_deg: np.ndarray
     footprints_m: np.ndarray
-    over: np.ndarray
-    seen: np.ndarray
-    jumped: np.ndarray
+    site_names: np.ndarray
+    ground_m: np.ndarray
+    is_jump: np.ndarray
 
 
-def fly(kind: str, site: Site, other: Site, rng: np.random.Generator) -> Track:
+def make_track(kind: str, site: Site, other: Site, rng: Rng) -> Track:
     """Make the track of a flight over a site; where it leaves the map, it goes on over the `other`."""
-    jumped, over = np.zeros(QUERIES, bool), np.full(QUERIES, site.name, dtype=object)
+    is_jump, site_names = np.zeros(QUERIES, bool), np.full(QUERIES, site.name, dtype=object)
     if kind == "foreign":
-        over[:] = other.name
-        seen = _across(other, QUERIES, rng)
-        at = (seen - seen[0]) * site.footprint_m / other.footprint_m + site.way[0]
+        site_names[:] = other.name
+        ground_m = _cross_site(other, QUERIES, rng)
+        position_m = (ground_m - ground_m[0]) * site.footprint_m / other.footprint_m + site.route_m[0]
     elif kind == "across":
-        at = seen = _across(site, QUERIES, rng)
+        position_m = ground_m = _cross_site(site, QUERIES, rng)
     else:
-        along, jumped = _along(kind, site, rng)
-        at = seen = _beside(site, along, rng)
+        along, is_jump = _follow_route(kind, site, rng)
+        position_m = ground_m = _fly_near_route(site, along, rng)
         if kind == "leave":
-            at, seen = at.copy(), seen.copy()
+            position_m, ground_m = position_m.copy(), ground_m.copy()
             away = slice(QUERIES // 3, 2 * QUERIES // 3)
-            over[away], seen[away] = other.name, _loop(other, away.stop - away.start, rng)
-            at[away] = at[away.start - 1] + (seen[away] - seen[away.start]) * site.footprint_m / other.footprint_m
-    step_m = float(np.median(np.hypot(*np.diff(site.way, axis=0).T)))
-    interval_s = float(np.clip(step_m / _CRUISE_M_S, *_INTERVAL_S))
-    flown_m = np.where(jumped, 0, np.hypot(*np.diff(at, axis=0, prepend=at[:1]).T))
-    t_s = 100.0 + np.cumsum(np.maximum(interval_s, flown_m / _FASTEST_M_S))  # the mapped way has holes
+            count = away.stop - away.start
+            out_m = _cross_site(other, (count + 1) // 2, rng)
+            site_names[away], ground_m[away] = other.name, np.vstack([out_m, out_m[::-1]])[:count]
+            shift_m = (ground_m[away] - ground_m[away.start]) * site.footprint_m / other.footprint_m
+            position_m[away] = position_m[away.start - 1] + shift_m
+    step_m = float(np.median(np.hypot(*np.diff(site.route_m, axis=0).T)))
+    interval_s = float(np.clip(step_m / _CRUISE_SPEED_M_S, *_QUERY_INTERVALS_S))
+    flown_m = np.where(is_jump, 0, np.hypot(*np.diff(position_m, axis=0, prepend=position_m[:1]).T))
+    t_s = 100.0 + np.cumsum(np.maximum(interval_s, flown_m / _MAX_SPEED_M_S))  # the mapped way has holes
     return Track(
         t_s=t_s,
-        at=at,
-        heading_deg=_headings(at, jumped, rng),
-        footprints_m=_footprints(site, other, over, seen, rng),
-        over=over,
-        seen=seen,
-        jumped=jumped,
+        position_m=position_m,
+        heading_deg=_make_headings(position_m, is_jump, rng),
+        footprints_m=_find_footprints_m(site, other, site_names == site.name, ground_m, rng),
+        site_names=site_names,
+        ground_m=ground_m,
+        is_jump=is_jump,
     )
 
 
-def _along(kind: str, site: Site, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _follow_route(kind: str, site: Site, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
     """Return which place of the way each query is at (N,), between two places too, and where it was carried."""
-    last, jumped = len(site.way) - 1, np.zeros(QUERIES, bool)
+    last, is_jump = len(site.route_m) - 1, np.zeros(QUERIES, bool)
     pace = np.ones(QUERIES)
     if kind == "half speed":
         pace[:] = 0.5
@@ -101,94 +111,87 @@ def _along(kind: str, site: Site, rng: np.random.Generator) -> tuple[np.ndarray,
         pace[QUERIES // 3 : 2 * QUERIES // 3 + 1] = 0.0
     places = rng.uniform(0, max(0.0, last - pace.sum())) + np.cumsum(pace)
     if kind == "turning back":
-        places = places[0] + _folded(np.arange(QUERIES), min(QUERIES // 3, last))
-    places = _folded(places, last)
+        places = places[0] + _fold_back(np.arange(QUERIES), min(QUERIES // 3, last))
+    places = _fold_back(places, last)
     if kind == "backwards":
         places = last - places
     elif kind == "jump":
-        for at in (QUERIES // 3, 2 * QUERIES // 3):
-            places[at:] = _folded(places[at:] + last / 2, last)
-            jumped[at] = True
-    return places, jumped
+        for start in (QUERIES // 3, 2 * QUERIES // 3):
+            places[start:] = _fold_back(places[start:] + last / 2, last)
+            is_jump[start] = True
+    return places, is_jump
 
 
-def _folded(places: np.ndarray, last: int) -> np.ndarray:
+def _fold_back(places: np.ndarray, last: int) -> np.ndarray:
     """Turn back at both ends of the way."""
     return last - abs(places % (2 * last) - last)
 
 
-def _beside(site: Site, places: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _fly_near_route(site: Site, places: np.ndarray, rng: Rng) -> np.ndarray:
     """Return points beside the mapped way, as far aside as another flight would be."""
-    numbers = np.arange(len(site.way))
-    points = np.column_stack([np.interp(places, numbers, site.way[:, axis]) for axis in (0, 1)])
-    aside = np.column_stack([make_oscillation(rng, len(places)) for _ in range(2)]) * _ASIDE * site.footprint_m
+    numbers = np.arange(len(site.route_m))
+    points = np.column_stack([np.interp(places, numbers, site.route_m[:, axis]) for axis in (0, 1)])
+    aside = np.column_stack([make_oscillation(rng, len(places)) for _ in range(2)]) * _ROUTE_OFFSET * site.footprint_m
     still = np.append(False, np.diff(places) == 0)
-    for at in np.flatnonzero(still):  # hovering, it stays within a fiftieth of a picture
-        aside[at] = aside[at - 1] + rng.normal(0, 0.005, 2) * site.footprint_m
-    return site.snapped(points + aside)
+    for number in np.flatnonzero(still):  # hovering, it stays within a fiftieth of a picture
+        aside[number] = aside[number - 1] + rng.normal(0, 0.005, 2) * site.footprint_m
+    return site.room.snap(points + aside)
 
 
-def _across(site: Site, count: int, rng: np.random.Generator) -> np.ndarray:
+def _cross_site(site: Site, count: int, rng: Rng) -> np.ndarray:
     """Return points on straight lines between random points that can be flown over, far from each other, at the pace of
     the mapped flight."""
-    free = site.room.points()
-    step_m = float(np.median(np.hypot(*np.diff(site.way, axis=0).T)))
+    free = site.room.list_points_m()
+    step_m = float(np.median(np.hypot(*np.diff(site.route_m, axis=0).T)))
     line = [free[rng.integers(len(free))]]
     while len(line) < count:
         ends = free[rng.integers(len(free), size=20)]
         end = ends[np.argmax(np.hypot(*(ends - line[-1]).T))]
         steps = max(1, round(float(np.hypot(*(end - line[-1]))) / step_m))
         line += [line[-1] + (end - line[-1]) * part for part in np.arange(1, steps + 1) / steps]
-    return site.snapped(np.array(line[:count]))
+    return site.room.snap(np.array(line[:count]))
 
 
-def _loop(site: Site, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return points that lead away and back again."""
-    out = _across(site, (count + 1) // 2, rng)
-    return np.vstack([out, out[::-1]])[:count]
-
-
-def _headings(at: np.ndarray, jumped: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _make_headings(position_m: np.ndarray, is_jump: np.ndarray, rng: Rng) -> np.ndarray:
     """Return headings (N,): the nose is turned from the course by an angle of the flight, and swings."""
-    step = np.vstack([at[1] - at[0], np.diff(at, axis=0)])
-    course, known = np.zeros(len(at)), 0.0
+    step = np.vstack([position_m[1] - position_m[0], np.diff(position_m, axis=0)])
+    course, last_deg = np.zeros(len(position_m)), 0.0
     for number, (east, north) in enumerate(step):
-        if not jumped[number] and np.hypot(east, north) > 1.0:
-            known = np.degrees(np.arctan2(east, north))
-        course[number] = known
-    return (course + rng.uniform(0, 360) + 5.0 * make_oscillation(rng, len(at))) % 360
+        if not is_jump[number] and np.hypot(east, north) > 1.0:
+            last_deg = np.degrees(np.arctan2(east, north))
+        course[number] = last_deg
+    return (course + rng.uniform(0, 360) + 5.0 * make_oscillation(rng, len(position_m))) % 360
 
 
-def _footprints(site: Site, other: Site, over: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _find_footprints_m(site: Site, other: Site, is_home: np.ndarray, ground_m: np.ndarray, rng: Rng) -> np.ndarray:
     """Return the ground under the pictures: that of the nearest place, since the scale of a mosaic is not the same all
     over, as seen from up to a fifth lower or higher, and lower where there is not so much ground."""
-    nearest = np.argmin(((seen[:, None] - site.way[None]) ** 2).sum(axis=2), axis=1)
+    nearest = np.argmin(((ground_m[:, None] - site.route_m[None]) ** 2).sum(axis=2), axis=1)
     own = np.convolve(np.pad(site.footprints_m[nearest], 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    higher = rng.uniform(0.8, 1.2) * (1 + 0.03 * make_oscillation(rng, len(seen)))
-    at_home = over == site.name
-    widest_m = np.where(at_home, site.widest_m.at(seen), other.widest_m.at(seen))
-    return np.minimum(np.where(at_home, own, other.footprint_m) * higher, widest_m)
+    higher = rng.uniform(0.8, 1.2) * (1 + 0.03 * make_oscillation(rng, len(ground_m)))
+    widest_m = np.where(is_home, site.widest_m.sample(ground_m), other.widest_m.sample(ground_m))
+    return np.minimum(np.where(is_home, own, other.footprint_m) * higher, widest_m)
 
 
-def reports(track: Track, site: Site, how: str, rng: np.random.Generator) -> list[Vehicle | None]:
+def simulate_reports(track: Track, site: Site, how: str, rng: Rng) -> list[Vehicle | None]:
     """Return what the autopilot says at each query, of its odometry only: a velocity whose scale, bias and noise are
     wrong, and the position that it leads to. `how` is one of `ODOMETRY`."""
     step_s = np.diff(track.t_s, prepend=track.t_s[0] - 1)[:, None]
-    true = np.diff(track.at, axis=0, prepend=track.at[:1]) / step_s
-    true[track.jumped] = 0
-    bias = _BIAS_M_S * np.column_stack([make_oscillation(rng, len(true)) for _ in range(2)])
-    told = true * rng.normal(1, _SCALE_SD) + bias + rng.normal(0, _NOISE_M_S, true.shape)
+    true = np.diff(track.position_m, axis=0, prepend=track.position_m[:1]) / step_s
+    true[track.is_jump] = 0
+    bias = _VELOCITY_BIAS_M_S * np.column_stack([make_oscillation(rng, len(true)) for _ in range(2)])
+    velocity_m_s = true * rng.normal(1, _VELOCITY_SCALE_SD) + bias + rng.normal(0, _VELOCITY_NOISE_M_S, true.shape)
     from_here = len(true) // 3
-    told[from_here:] *= {"doubles": 2.0, "halves": 0.5}.get(how, 1.0)
+    velocity_m_s[from_here:] *= {"doubles": 2.0, "halves": 0.5}.get(how, 1.0)
     heading = track.heading_deg + rng.normal(0, _HEADING_SD_DEG) + rng.normal(0, 1, len(true))
-    at = track.at[0] + np.cumsum(told * step_s, axis=0)
-    said: list[Vehicle | None] = []
+    position_m = track.position_m[0] + np.cumsum(velocity_m_s * step_s, axis=0)
+    reports: list[Vehicle | None] = []
     for number, t_s in enumerate(track.t_s.tolist()):
         if how == "stops" and number > from_here:
-            said.append(said[-1])
+            reports.append(reports[-1])
             continue
-        lat_deg, lon_deg = offset_position(*site.origin, *at[number].tolist())
-        velocity = tuple(told[number].tolist())
+        lat_deg, lon_deg = offset_position(*site.origin, *position_m[number].tolist())
+        velocity = tuple(velocity_m_s[number].tolist())
         if how == "not a number" and number >= from_here:
             velocity = (np.nan, np.nan)
         vehicle = Vehicle(
@@ -200,12 +203,12 @@ def reports(track: Track, site: Site, how: str, rng: np.random.Generator) -> lis
             has_gps=False,
             velocity_m_s=velocity,
         )
-        said.append(None if how == "missing" else vehicle)
-    return said
+        reports.append(None if how == "missing" else vehicle)
+    return reports
 
 
-def photographs(
-    track: Track, photos: Mapping[str, Orthophoto], sites: Mapping[str, Site], rng: np.random.Generator
+def take_photographs(
+    track: Track, photos: Mapping[str, Orthophoto], sites: Mapping[str, Site], rng: Rng
 ) -> Iterator[np.ndarray | None]:
     """Take the pictures of a flight, in light and by a camera of its own, uint8 (480, 640, 3) BGR; None where too
     little of one has ground."""
@@ -218,8 +221,8 @@ def photographs(
     )
     camera = replace(Camera(), noise_sigma=rng.uniform(1, 5), blur_px=rng.uniform(0, 2.5))
     quality = (cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(70, 95)))
-    roll, pitch = (_SWAY_DEG * make_oscillation(rng, len(track.at)) for _ in range(2))
-    for number, name in enumerate(track.over):
+    roll, pitch = (_SWAY_DEG * make_oscillation(rng, len(track.position_m)) for _ in range(2))
+    for number, name in enumerate(track.site_names):
         pose = CameraPose(
             east_m=0.0,
             north_m=0.0,
@@ -228,5 +231,7 @@ def photographs(
             roll_deg=float(roll[number]),
             pitch_deg=float(pitch[number]),
         )
-        image = photograph_ground(photos[name], sites[name].position(track.seen[number]), pose, camera, light, rng)
+        image = photograph_ground(
+            photos[name], sites[name].to_position(track.ground_m[number]), pose, camera, light, rng
+        )
         yield image if image is None else cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)

@@ -29,6 +29,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import base
@@ -37,9 +38,9 @@ import flight_sites
 import flight_tracks
 import numpy as np
 import walks
-from base import Row, use_of
-from flight_sites import ROWS, Site
-from where import honest, spread
+from base import Row, find_use
+from flight_sites import ROWS_SITE, Site
+from where import compute_sigma_shares, summarise
 
 from edgevpr.core.contract import Technique
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -56,8 +57,11 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _SEED = 2026
-_WRONG_OF_SIDE, _WRONG_SD, _FAR_OF_SIDE = 0.25, 3.0, 0.5
-_OVER_THE_MAP = 0.5  # of the picture at least is shown by pictures of the map
+# A fix is wrong beyond both: sides of the map's pictures on the ground, and standard deviations that it claims.
+_WRONG_ERROR_SIDES = 0.25
+_WRONG_ERROR_SIGMAS = 3.0
+_FAR_ERROR_SIDES = 0.5
+_MIN_MAPPED_SHARE = 0.5  # of a picture over the map is in pictures of the map
 _COLUMNS = {
     "flights": "{name}",
     "mode": "{mode}",
@@ -69,26 +73,23 @@ _COLUMNS = {
     "claimed sd m": "{claimed_sd_m:.1f}",
     "within 1, 2 sigma": "{within[one_sigma]:.2f} / {within[two_sigma]:.2f}",
 }
-FLOWN = {
+SITES = {
     **dict.fromkeys(("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "kite_ochota"), flight_tracks.KINDS),
     "aerial_copr": ("along", "across", "jump", "leave", "foreign"),
-    ROWS: ("along", "backwards", "half speed", "across", "jump"),
+    ROWS_SITE: ("along", "backwards", "half speed", "across", "jump"),
 }
 
 
-def _recogniser(
+def _make_recogniser(
     technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, tracks_flight: bool = False
 ) -> Recogniser:
-    config = walks.config()
-    reach_m_s, rule = (
-        config.match.reach_m_s,
-        make_accept_rule(technique, config.match, length, read_calibration_for(place_map)),
-    )
-    return walks.walk(
+    config = walks.make_config()
+    reach_m_s = config.match.reach_m_s
+    return walks.make_walk(
         place_map,
         index,
         technique,
-        rule=rule,
+        rule=make_accept_rule(technique, config.match, length, read_calibration_for(place_map)),
         search=make_sequence_search(length),
         prior=Prior(reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
@@ -98,9 +99,9 @@ def _recogniser(
 
 # The ways of recognising, as a flight has them.
 MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
-    "filter": partial(_recogniser, tracks_flight=True),
-    "alone": partial(_recogniser),
-    "sequence 10": partial(_recogniser, length=10),
+    "filter": partial(_make_recogniser, tracks_flight=True),
+    "alone": partial(_make_recogniser),
+    "sequence 10": partial(_make_recogniser, length=10),
 }
 
 
@@ -115,11 +116,11 @@ class Flight:
     other: str
 
 
-def planned() -> list[Flight]:
+def plan_flights() -> list[Flight]:
     """Return all flights."""
     flights = []
-    for site, kinds in FLOWN.items():
-        others = [name for name in FLOWN if name != site and not {name, site} <= {"aerial_copr", ROWS}]
+    for site, kinds in SITES.items():
+        others = [name for name in SITES if name != site and not {name, site} <= {"aerial_copr", ROWS_SITE}]
         for kind in kinds:
             number = len(flights)
             odometry = flight_tracks.ODOMETRY[number % len(flight_tracks.ODOMETRY)]
@@ -127,102 +128,109 @@ def planned() -> list[Flight]:
     return flights
 
 
-def flown(flight: Flight, sites: dict[str, Site]) -> list[Row]:
+def run_flight(flight: Flight, sites: dict[str, Site]) -> list[Row]:
     """Fly once, and ask every mode with each picture; return a row for each query and mode."""
     cv2.setNumThreads(1)
     site, rng = sites[flight.site], np.random.default_rng((_SEED, flight.number))
-    track = flight_tracks.fly(flight.kind, site, sites[flight.other], rng)
-    said = flight_tracks.reports(track, site, flight.odometry, rng)
-    photos = {name: Orthophoto(sites[name].flown) for name in {flight.site, flight.other}}
-    opened = open_recogniser(walks.config(map=str(site.place_map)), load_board("this"))
-    asked = {mode: make(opened.technique, opened.place_map, opened.index) for mode, make in MODES.items()}
-    share, of_flight = site.covered.at(track.at), {"flight": flight.number, "site": site.name, "kind": flight.kind}
+    track = flight_tracks.make_track(flight.kind, site, sites[flight.other], rng)
+    reports = flight_tracks.simulate_reports(track, site, flight.odometry, rng)
+    photos = {name: Orthophoto(sites[name].query_mosaic) for name in {flight.site, flight.other}}
+    opened = open_recogniser(walks.make_config(map=str(site.place_map)), load_board("this"))
+    recognisers = {mode: make(opened.technique, opened.place_map, opened.index) for mode, make in MODES.items()}
+    share, fields = (
+        site.covered.sample(track.position_m),
+        {"flight": flight.number, "site": site.name, "kind": flight.kind},
+    )
     rows = []
-    for number, image in enumerate(flight_tracks.photographs(track, photos, sites, rng)):
+    for number, image in enumerate(flight_tracks.take_photographs(track, photos, sites, rng)):
         if image is None:
             continue
-        t_s, (east_m, north_m), over = float(track.t_s[number]), track.at[number].tolist(), track.over[number]
+        t_s, (east_m, north_m), ground = (
+            float(track.t_s[number]),
+            track.position_m[number].tolist(),
+            track.site_names[number],
+        )
         query: Row = {
-            **of_flight,
+            **fields,
             "odometry": flight.odometry,
             "t_s": round(t_s, 2),
             "east_m": round(east_m, 2),
             "north_m": round(north_m, 2),
-            "over": over,
-            "is_mapped": bool(over == site.name and share[number] >= _OVER_THE_MAP),
+            "over": ground,
+            "is_mapped": bool(ground == site.name and share[number] >= _MIN_MAPPED_SHARE),
         }
-        frame = walks.frame(image, f"{number:03d}", t_s)
-        for mode, recogniser in asked.items():
-            rows.append(query | {"mode": mode} | _told(recogniser.step(frame, said[number]), site, query))
-    for each in (*photos.values(), opened.place_map):
-        each.close()
+        frame = walks.make_frame(image, f"{number:03d}", t_s)
+        for mode, recogniser in recognisers.items():
+            rows.append(query | {"mode": mode} | _score_fix(recogniser.step(frame, reports[number]), site, query))
+    for opened_file in (*photos.values(), opened.place_map):
+        opened_file.close()
     return rows
 
 
-def _told(event: Recognition, site: Site, query: Row) -> Row:
+def _score_fix(event: Recognition, site: Site, query: Row) -> Row:
     """Return what a query has led to: `fix` is "right", "wrong" or None, with its error by the truth of the query."""
-    where = event.located
-    if where is None:
+    located = event.located
+    if located is None:
         return {"fix": None}
-    off_m = site.offset(where.position) - (query["east_m"], query["north_m"])
-    error_m, side_m, sd_m = float(np.hypot(*off_m)), site.footprint_m, where.accuracy_m
+    off_m = site.to_offset_m(located.position) - (query["east_m"], query["north_m"])
+    error_m, side_m, sd_m = float(np.hypot(*off_m)), site.footprint_m, located.accuracy_m
     foreign = query["over"] != site.name
-    is_wrong = foreign or error_m > max(_WRONG_OF_SIDE * side_m, _WRONG_SD * sd_m)
+    is_wrong = foreign or error_m > max(_WRONG_ERROR_SIDES * side_m, _WRONG_ERROR_SIGMAS * sd_m)
     return {
         "fix": "wrong" if is_wrong else "right",
-        "is_far": bool(foreign or error_m > _FAR_OF_SIDE * side_m),
+        "is_far": bool(foreign or error_m > _FAR_ERROR_SIDES * side_m),
         "off_m": complex(*off_m),
         "sd_m": round(sd_m, 2),
-        "variances_m2": (where.covariance_m2[0], where.covariance_m2[2]),
+        "variances_m2": (located.covariance_m2[0], located.covariance_m2[2]),
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sites", metavar="A,B", default=",".join(FLOWN), help="whose maps are flown with (all)")
+    parser.add_argument("--sites", metavar="A,B", default=",".join(SITES), help="whose maps are flown with (all)")
     args = parser.parse_args()
-    base.find_sets(names=[name for name in FLOWN if name != ROWS])
+    base.find_sets(names=[name for name in SITES if name != ROWS_SITE])
     began_s, rows = time.monotonic(), []
-    flights = [flight for flight in planned() if flight.site in args.sites.split(",")]
+    flights = [flight for flight in plan_flights() if flight.site in args.sites.split(",")]
     with (
         tempfile.TemporaryDirectory(prefix="edgevpr-flights-") as work,
         ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool,
     ):
-        prepare = partial(flight_sites.prepare, data=base.DATA, work=Path(work))
-        sites = {site.name: site for site in pool.map(prepare, FLOWN)}
-        for flight, new in zip(flights, pool.map(partial(flown, sites=sites), flights), strict=True):
+        prepare = partial(flight_sites.prepare_site, data=base.DATA, work=Path(work))
+        sites = {site.name: site for site in pool.map(prepare, SITES)}
+        for flight, new in zip(flights, pool.map(partial(run_flight, sites=sites), flights), strict=True):
             rows += new
             print(flight, flush=True)
-    found = {**base.made_by(), "took_s": round(time.monotonic() - began_s), **summary(rows, list(MODES))}
-    base.write("flights", found, page(found))
+    result = {**base.describe_run(), "took_s": round(time.monotonic() - began_s), **summarise_modes(rows, list(MODES))}
+    base.write("flights", result, format_page(result))
 
 
-def summary(rows: Sequence[Row], modes: Sequence[str]) -> dict:
+def summarise_modes(rows: Sequence[Row], modes: Sequence[str]) -> dict:
     """Return the figures of every mode, by what the flights have in common."""
     groups: dict[str, Callable[[Row], object]] = {
         "all": lambda row: "all",
-        "use": lambda row: use_of(row["site"]),
+        "use": lambda row: find_use(row["site"]),
         "site": lambda row: row["site"],
         "kind": lambda row: row["kind"],
         "odometry": lambda row: row["odometry"],
     }
-    found: dict[str, dict] = {}
-    for group, of in groups.items():
-        names = dict.fromkeys(of(row) for row in rows)
-        found[group] = {
-            name: {mode: _figures([row for row in rows if row["mode"] == mode and of(row) == name]) for mode in modes}
-            for name in names
-        }
-    return found
+    result: dict[str, dict] = {}
+    for group, key in groups.items():
+        names = dict.fromkeys(key(row) for row in rows)
+        result[group] = {name: {} for name in names}
+        for name, mode in product(names, modes):
+            own = [row for row in rows if key(row) == name and row["mode"] == mode]
+            result[group][name][mode] = _compute_figures(own)
+    return result
 
 
-def _figures(rows: Sequence[Row]) -> dict:
+def _compute_figures(rows: Sequence[Row]) -> dict:
     flights = {number: [row for row in rows if row["flight"] == number] for number in {row["flight"] for row in rows}}
-    lost = [_lost(each) for each in flights.values()]
+    over_s, lost_s, gaps = zip(*map(_measure_lost_time, flights.values()), strict=True)
     fixes = [row for row in rows if row["fix"]]
     right = [row for row in fixes if row["fix"] == "right"]
-    own = [row for row in fixes if row["over"] == row["site"]]
-    gaps_s = [max(each) for _, _, each in lost if each]
+    own = [(row["off_m"], row["variances_m2"]) for row in fixes if row["over"] == row["site"]]
+    gaps_s = [max(gaps_of_flight) for gaps_of_flight in gaps if gaps_of_flight]
     return {
         "flights": len(flights),
         "queries": len(rows),
@@ -231,51 +239,51 @@ def _figures(rows: Sequence[Row]) -> dict:
         "wrong": len(fixes) - len(right),
         "far_off": sum(row["is_far"] for row in fixes),
         "wrong_over_other_ground": sum(row["over"] != row["site"] for row in fixes),
-        "over_the_map_s": round(sum(each[0] for each in lost)),
-        "lost_s": round(sum(each[1] for each in lost)),
+        "over_the_map_s": round(sum(over_s)),
+        "lost_s": round(sum(lost_s)),
         "longest_gap_s": {"median": round(np.median(gaps_s), 1), "worst": round(max(gaps_s), 1)} if gaps_s else None,
-        "error": spread([row["off_m"] for row in right]) if right else None,
+        "error": summarise([row["off_m"] for row in right]) if right else None,
         "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
-        "within": honest([row["off_m"] for row in own], [row["variances_m2"] for row in own], 0.0) if own else None,
+        "within": compute_sigma_shares(*zip(*own, strict=True), 0.0) if own else None,
     }
 
 
-def _lost(rows: Sequence[Row]) -> tuple[float, float, list[float]]:
+def _measure_lost_time(rows: Sequence[Row]) -> tuple[float, float, list[float]]:
     """Return, of one flight, the seconds over the map, those of queries without a fix that is right, and the times
     between one such fix, or the begin, and the next, or the end. Each stretch over the map counts by itself."""
     over_s = lost_s = 0.0
     gaps_s: list[float] = []
-    since = None
+    since_s = None
     for before, row in zip([None, *rows[:-1]], rows, strict=True):
         if not row["is_mapped"]:
-            since = None
+            since_s = None
             continue
-        if since is None:
-            since = row["t_s"]
+        if since_s is None:
+            since_s = row["t_s"]
         elif before is not None:
             took_s = row["t_s"] - before["t_s"]
             over_s += took_s
             lost_s += took_s * (row["fix"] != "right")
-        gaps_s.append(row["t_s"] - since)
+        gaps_s.append(row["t_s"] - since_s)
         if row["fix"] == "right":
-            since = row["t_s"]
+            since_s = row["t_s"]
     return over_s, lost_s, gaps_s
 
 
-def page(result: Row) -> str:
+def format_page(result: Row) -> str:
     """Return the results as Markdown."""
     tables = []
     for group in ("all", "use", "site", "kind", "odometry"):
         rows = [
-            each | {"name": name, "mode": mode, "lost": over_s and each["lost_s"] / over_s}
+            figures | {"name": name, "mode": mode, "lost": over_s and figures["lost_s"] / over_s}
             for name, modes in result[group].items()
-            for mode, each in modes.items()
-            for over_s in [each["over_the_map_s"] or None]
+            for mode, figures in modes.items()
+            for over_s in [figures["over_the_map_s"] or None]
         ]
-        tables.append((f"By {group}:\n\n" if group != "all" else "") + base.table(rows, _COLUMNS))
+        tables.append((f"By {group}:\n\n" if group != "all" else "") + base.format_table(rows, _COLUMNS))
     return f"""# Flights over real aerial pictures
 
-{base.told(__doc__)}
+{base.strip_title(__doc__)}
 
 Right, wrong, far off: fixes. Lost: share of the time over the map. Gap: the longest without a right fix over the map,
 median and worst of the flights. Errors: median / 95th percentile of right fixes. Within: shares of errors, axis by
@@ -284,7 +292,7 @@ ground.
 
 {tables[0]}
 
-Constants of edgevpr were chosen on {" and ".join(name for name in base.TUNED_ON if name in result["site"])} (use
+Constants of edgevpr were chosen on {" and ".join(name for name in base.TUNING_SETS if name in result["site"])} (use
 *tune*), of the sites here; on none of these flights.
 
 {(chr(10) * 2).join(tables[1:])}

@@ -18,44 +18,48 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, 
 from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M
 from edgevpr.lab.simulate.landscape import make_scene
 
-MIRRORED, GENERATED, OTHER_SET = "mirrored", "generated", "other set"  # how names begin
+# The names of the places begin with one of these.
+MIRRORED_PREFIX = "mirrored"
+GENERATED_PREFIX = "generated"
+OTHER_SET_PREFIX = "other set"
 # Neither is the ground of a site that is asked for. grief_stromovka_monthly is: it is the park of the seasons.
 OTHER_SETS = ("nordland_tiny/ref", "nordland_tiny/query", "train_ie_tower/images", "grief_michigan_monthly/query")
-_CROPS = 8  # of a picture
+_CROPS_PER_IMAGE = 8  # of a picture
 _MARGIN_M = 65.0  # of a scene: nothing beyond its edge is seen
-_EAST, _NORTH = 22, 12  # places of a scene
+_PLACES_EAST = 22  # of a scene
+_PLACES_NORTH = 12
 _FIRST_SEED = 1000
 
 
-def foreign(camera: str, count: int, data: Path, sites: list[Path]) -> Iterator[Frame]:
+def yield_foreign_places(camera: str, count: int, data: Path, sites: list[Path]) -> Iterator[Frame]:
     """Yield `count` places in the order of their mapping; fewer, where there are no more (looking ahead)."""
-    frames = _down(sites) if camera == "nadir" else _ahead(data)
+    frames = _yield_nadir_places(sites) if camera == "nadir" else _yield_forward_places(data)
     return islice(frames, count)
 
 
-def _down(sites: list[Path]) -> Iterator[Frame]:
+def _yield_nadir_places(sites: list[Path]) -> Iterator[Frame]:
     for site in sites:
         for part in ("ref", "query"):
             for path in list_images(site / part):
                 mirrored = read_image(path)[:, ::-1]
                 rng = np.random.default_rng(zlib.crc32(f"{site.name}/{path.name}".encode()))
-                for number in range(_CROPS):
-                    name = f"{MIRRORED}/{site.name}/{path.name}/{number}"
-                    yield _frame(_cut(mirrored, *rng.uniform((0.5, 0, 0), (1, 1, 1))), name)
+                for number in range(_CROPS_PER_IMAGE):
+                    name = f"{MIRRORED_PREFIX}/{site.name}/{path.name}/{number}"
+                    yield _make_frame(_crop_image(mirrored, *rng.uniform((0.5, 0, 0), (1, 1, 1))), name)
     seed = _FIRST_SEED
     while True:
-        yield from _landscape(seed)
+        yield from _yield_landscape(seed)
         seed += 1
 
 
-def _cut(image: np.ndarray, share: float, down: float, right: float) -> np.ndarray:
+def _crop_image(image: np.ndarray, share: float, down: float, right: float) -> np.ndarray:
     """Cut a picture to a share of its sides; `down` and `right` (0..1) say from where."""
     high, wide = (round(share * side) for side in image.shape[:2])
     top, left = round(down * (image.shape[0] - high)), round(right * (image.shape[1] - wide))
     return image[top : top + high, left : left + wide]
 
 
-def _landscape(seed: int) -> Iterator[Frame]:
+def _yield_landscape(seed: int) -> Iterator[Frame]:
     """Yield the places of a generated landscape, under a light of its own, from heights of 50 to 80 m."""
     rng = np.random.default_rng(seed)
     light = Light(
@@ -67,15 +71,15 @@ def _landscape(seed: int) -> Iterator[Frame]:
     )
     scene = make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M)
     ground = light_scene(scene, light, seed)
-    for north_m in np.linspace(_MARGIN_M, SCENE_DEPTH_M - _MARGIN_M, _NORTH):
-        for east_m in np.linspace(_MARGIN_M, SCENE_WIDTH_M - _MARGIN_M, _EAST):
+    for north_m in np.linspace(_MARGIN_M, SCENE_DEPTH_M - _MARGIN_M, _PLACES_NORTH):
+        for east_m in np.linspace(_MARGIN_M, SCENE_WIDTH_M - _MARGIN_M, _PLACES_EAST):
             height_m, heading_deg = rng.uniform((50, 0), (80, 360))
             pose = CameraPose(east_m=east_m, north_m=north_m, height_m=height_m, heading_deg=heading_deg)
             image = photograph(ground, scene.metres_per_pixel, pose, Camera(), light, rng)
-            yield _frame(image, f"{GENERATED}/{seed}/{north_m:.0f}/{east_m:.0f}")
+            yield _make_frame(image, f"{GENERATED_PREFIX}/{seed}/{north_m:.0f}/{east_m:.0f}")
 
 
-def _ahead(data: Path) -> Iterator[Frame]:
+def _yield_forward_places(data: Path) -> Iterator[Frame]:
     cuts = {"whole": (0.0, 1.0), "left": (0.0, 0.7), "right": (0.3, 1.0)}
     for is_mirrored in (False, True):
         for cut, (start, end) in cuts.items():
@@ -83,10 +87,10 @@ def _ahead(data: Path) -> Iterator[Frame]:
                 for path in list_images(data / folder):
                     image = read_image(path)
                     wide = image.shape[1]
-                    image = image[:, round(start * wide) : round(end * wide)]
-                    way = f"{'mirrored ' if is_mirrored else ''}{cut}"
-                    yield _frame(image[:, ::-1] if is_mirrored else image, f"{OTHER_SET}/{way}/{folder}/{path.name}")
+                    image = image[:, round(start * wide) : round(end * wide)][:, :: -1 if is_mirrored else 1]
+                    change = f"{'mirrored ' if is_mirrored else ''}{cut}"
+                    yield _make_frame(image, f"{OTHER_SET_PREFIX}/{change}/{folder}/{path.name}")
 
 
-def _frame(image: np.ndarray, name: str) -> Frame:
+def _make_frame(image: np.ndarray, name: str) -> Frame:
     return Frame(image=np.ascontiguousarray(image), name=name, t_mono_s=0.0)

@@ -38,15 +38,22 @@ from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 
-SET, FOV_DEG, HEIGHT_M = "sat_marash", 66.0, 120.0
+SET_NAME = "sat_marash"
+FOV_DEG = 66.0
+HEIGHT_M = 120.0
 FOOTPRINT_M = 2 * HEIGHT_M * float(np.tan(np.radians(FOV_DEG / 2)))
 SPACING_M = 40.0
-_GRID, _SEED, _TURNS = (12, 8), 7, 8
-_SITE = "Hatay_Mimar_Sinan"  # that the rasters show
-TOLD, RESOLUTIONS_M, _SHARP = (1.0, 0.65, 0.8, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0), "0.5 m"
+_GRID = (12, 8)  # pictures in a row, and rows
+_SEED = 7
+_FOREIGN_ROTATIONS = 8
+_RASTER_SITE = "Hatay_Mimar_Sinan"  # that the rasters show
+FOOTPRINT_SCALES = (1.0, 0.65, 0.8, 1.25, 1.5)
+RESOLUTIONS_M = (0.5, 1.0, 2.0, 4.0)
 _FOOTPRINT_SHARES = (0.62, 0.88, 1.25)
-_NOTHING, _KNOWN, _FLOWN = "nothing", "heading, height", "the flight so far"
-_STEP_S = 7.0  # from picture to picture, at 15 m/s
+_NOTHING_KNOWN = "nothing"
+_POSE_KNOWN = "heading, height"
+_FLIGHT_KNOWN = "the flight so far"
+_PICTURE_INTERVAL_S = 7.0  # from picture to picture, at 15 m/s
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 _COLUMNS = {
     "raster": "{raster}",
@@ -60,20 +67,20 @@ _COLUMNS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Cutting:
-    """A map to be cut from a `raster`, `at` shares of the footprint that the user tells, which is `told` times the
-    camera's."""
+class MapCut:
+    """A map to be cut from a `raster`, at `footprint_shares` of the footprint that the user gives, which is
+    `footprint_scale` times the camera's."""
 
     raster: Path
-    told: float
-    at: tuple[float, ...]
+    footprint_scale: float
+    footprint_shares: tuple[float, ...]
 
 
-def coarser(source: Path, path: Path, pixel_m: float) -> Path:
+def write_coarser_raster(source: Path, path: Path, pixel_m: float) -> Path:
     """Write a raster with larger pixels, each the mean of those that it covers."""
     with rasterio.open(source) as raster:
-        by = pixel_m / raster.res[0]
-        shape = raster.count, round(raster.height / by), round(raster.width / by)
+        factor = pixel_m / raster.res[0]
+        shape = raster.count, round(raster.height / factor), round(raster.width / factor)
         bands = raster.read(out_shape=shape, resampling=rasterio.enums.Resampling.average)
         affine = raster.transform * rasterio.Affine.scale(raster.width / shape[2], raster.height / shape[1])
         layout = {"driver": "GTiff", "count": shape[0], "height": shape[1], "width": shape[2], "dtype": "uint8"}
@@ -82,7 +89,7 @@ def coarser(source: Path, path: Path, pixel_m: float) -> Path:
     return path
 
 
-def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iterator[Frame]:
+def render_flight(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iterator[Frame]:
     """Take the pictures of the flight: a frame each, with all that an autopilot tells. A camera that looks ahead by
     `tilt_deg` sees the same ground."""
     half = np.tan(np.radians(fov_deg / 2))
@@ -90,15 +97,15 @@ def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iter
     height_m = FOOTPRINT_M / 2 / float(half)
     ahead_m = height_m * np.tan(np.radians(tilt_deg))
     south, west, north, east = photo.extent_deg
-    high_m, wide_m = (float(distance_m(south, west, *at)) for at in ((north, west), (south, east)))
+    high_m, wide_m = (float(distance_m(south, west, *corner)) for corner in ((north, west), (south, east)))
     inside_m = 0.75 * FOOTPRINT_M
     shots = []
     for row in np.linspace(inside_m, high_m - inside_m, _GRID[1]):
         for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0])[:: -1 if len(shots) // _GRID[0] % 2 else 1]:
             heading_deg = float(rng.uniform(0, 360))
             back_m = -ahead_m * np.array([np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))])
-            at = Position(*offset_position(south, west, column + back_m[0], row + back_m[1]))
-            shots.append(GeoTag(position=at, height_m=height_m, heading_deg=heading_deg))
+            camera_position = Position(*offset_position(south, west, column + back_m[0], row + back_m[1]))
+            shots.append(GeoTag(position=camera_position, height_m=height_m, heading_deg=heading_deg))
             if tilt_deg:
                 shots[-1] = replace(shots[-1], roll_deg=0.0, pitch_deg=tilt_deg)
     for number, (shot, pose) in enumerate(zip(shots, make_poses(shots, _SEED), strict=True)):
@@ -110,7 +117,7 @@ def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iter
         yield Frame(
             image=image,
             name=f"{number:03d}",
-            t_mono_s=_STEP_S * number,
+            t_mono_s=_PICTURE_INTERVAL_S * number,
             position=shot.position,
             height_m=height_m,
             **{name: getattr(pose, name) for name in ("heading_deg", "roll_deg", "pitch_deg")},
@@ -118,53 +125,52 @@ def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iter
     photo.close()
 
 
-def foreign(folder: Path) -> Iterator[Frame]:
+def yield_foreign_frames(folder: Path) -> Iterator[Frame]:
     """Give pictures of other ground: of the set's other sites, or of another set."""
-    sites = {row["file"]: row["site"] for row in base.read_csv(folder / "sites.csv")} if folder.name == SET else {}
+    sites = {row["file"]: row["site"] for row in base.read_csv(folder / "sites.csv")} if folder.name == SET_NAME else {}
     for path in sorted([*(folder / "ref").iterdir(), *(folder / "query").iterdir()]):
-        if sites.get(path.name) == _SITE:
+        if sites.get(path.name) == _RASTER_SITE:
             continue
         image = read_image(path)
         middle = image.shape[1] / 2 - 0.5, image.shape[0] / 2 - 0.5
-        for turn in range(_TURNS):
-            turn_deg = 360 * turn / _TURNS
+        for turn in range(_FOREIGN_ROTATIONS):
+            turn_deg = 360 * turn / _FOREIGN_ROTATIONS
             view = cv2.getRotationMatrix2D(middle, turn_deg, 1.25 if turn % 2 else 1.0)
             turned = cv2.warpAffine(image, view, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT)
             yield Frame(image=turned, name=path.name, t_mono_s=0.0, heading_deg=turn_deg, height_m=HEIGHT_M)
 
 
-def matched(path: Path, frames: Iterable[Frame], known: str, fov_deg: float = FOV_DEG) -> Row:
+def match_frames(path: Path, frames: Iterable[Frame], known: str, fov_deg: float = FOV_DEG) -> Row:
     """Match each picture by what is `known`: nothing, heading and height, or the pictures of the flight before it."""
-    is_told, is_flown = known == _KNOWN, known == _FLOWN
-    config = walks.config(
-        map=str(path), **{"source.camera": "nadir"}, **({"source.fov_deg": fov_deg} if is_told else {})
-    )
-    told = ("heading", "height") if is_told else ()
-    recogniser = open_recogniser(config, load_board("this"), known=told, uses_hints=is_flown, tracks_flight=is_flown)
+    knows_pose, knows_flight = known == _POSE_KNOWN, known == _FLIGHT_KNOWN
+    lens, prior = ({"source.fov_deg": fov_deg}, ("heading", "height")) if knows_pose else ({}, ())
+    config = walks.make_config(map=str(path), **{"source.camera": "nadir"}, **lens)
+    flags = {"uses_hints": knows_flight, "tracks_flight": knows_flight}
+    recogniser = open_recogniser(config, load_board("this"), known=prior, **flags)
     right, errors_m, claims_m = 0, [], []
     for frame in frames:
-        told = frame if is_told else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)
-        event = recogniser.step(replace(told, position=None))
+        given = frame if knows_pose else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)
+        event = recogniser.step(replace(given, position=None))
         if event.failed:
             raise base.EdgevprError(str(event.reason))
         errors_m.append(np.inf if event.accepted else np.nan)
         if frame.position is None:
             continue
-        here = frame.position.lat_deg, frame.position.lon_deg
+        truth = frame.position.lat_deg, frame.position.lon_deg
         if event.best and (place := event.best.place.position):
-            right += float(distance_m(*here, place.lat_deg, place.lon_deg)) < FOOTPRINT_M / 2
+            right += float(distance_m(*truth, place.lat_deg, place.lon_deg)) < FOOTPRINT_M / 2
         if event.accepted and event.position:
-            errors_m[-1] = float(distance_m(*here, event.position.lat_deg, event.position.lon_deg))
+            errors_m[-1] = float(distance_m(*truth, event.position.lat_deg, event.position.lon_deg))
             claims_m.append((errors_m[-1], event.accuracy_m))
     recogniser.place_map.close()
     accepted = ~np.isnan(errors_m)
-    found: Row = {"known": known, "places": len(recogniser.index), "queries": len(errors_m), "right": right}
-    found |= {"accepted": int(accepted.sum()), "wrong": int(np.sum(np.array(errors_m) > FOOTPRINT_M / 4))}
-    found |= judge_claims(claims_m)
+    result: Row = {"known": known, "places": len(recogniser.index), "queries": len(errors_m), "right": right}
+    result |= {"accepted": int(accepted.sum()), "wrong": int(np.sum(np.array(errors_m) > FOOTPRINT_M / 4))}
+    result |= judge_claims(claims_m)
     if len(errors_m) == _GRID[0] * _GRID[1]:
         by_row = accepted.reshape(_GRID[::-1]).sum(axis=1)
-        found["by_row"] = {"least": int(by_row.min()), "most": int(by_row.max())}
-    return found
+        result["by_row"] = {"least": int(by_row.min()), "most": int(by_row.max())}
+    return result
 
 
 def judge_claims(claims_m: list[tuple[float, float]]) -> Row:
@@ -181,51 +187,52 @@ def judge_claims(claims_m: list[tuple[float, float]]) -> Row:
     }
 
 
-def measured(cutting: Cutting, folder: Path, work: Path, frames: list[Frame]) -> list[Row]:
+def measure_map(cut: MapCut, folder: Path, work: Path, frames: list[Frame]) -> list[Row]:
     """Cut the map, and match the pictures of the flight; over the map of the sharp raster, cut as told, foreign too."""
-    path = work / f"{cutting.raster.stem} {cutting.told:g} {len(cutting.at)}.gpkg"
-    footprints = ",".join(f"{share * cutting.told * FOOTPRINT_M:.1f}" for share in cutting.at)
+    path = work / f"{cut.raster.stem} {cut.footprint_scale:g} {len(cut.footprint_shares)}.gpkg"
+    footprints = ",".join(f"{share * cut.footprint_scale * FOOTPRINT_M:.1f}" for share in cut.footprint_shares)
     size = ("--footprint-m", footprints, "--spacing-m", f"{SPACING_M:g}")
-    base.edgevpr("map", "build", path, "--orthophoto", cutting.raster, *size)
-    rows = [matched(path, frames, known) for known in (_NOTHING, _KNOWN, _FLOWN)]
-    if cutting.raster.stem == _SHARP and cutting.told == 1:
-        others = [each for each in base.find_sets(camera="nadir") if each.name != SET]
+    base.run_edgevpr("map", "build", path, "--orthophoto", cut.raster, *size)
+    rows = [match_frames(path, frames, known) for known in (_NOTHING_KNOWN, _POSE_KNOWN, _FLIGHT_KNOWN)]
+    if cut.raster.stem == f"{RESOLUTIONS_M[0]:g} m" and cut.footprint_scale == 1:
+        others = [other for other in base.find_sets(camera="nadir") if other.name != SET_NAME]
         for known, folders in (("foreign: other sites", [folder]), ("foreign: other sets", others)):
-            found = matched(path, chain.from_iterable(map(foreign, folders)), _KNOWN)
-            rows.append(found | {"known": known, "right": "-"})
-    cut_at = ", ".join(f"{share:g}" for share in cutting.at)
-    rows = [{"raster": cutting.raster.stem, "told": cutting.told, "cut_at": cut_at, **row} for row in rows]
+            matched = match_frames(path, chain.from_iterable(map(yield_foreign_frames, folders)), _POSE_KNOWN)
+            rows.append(matched | {"known": known, "right": "-"})
+    cut_at = ", ".join(f"{share:g}" for share in cut.footprint_shares)
+    rows = [{"raster": cut.raster.stem, "told": cut.footprint_scale, "cut_at": cut_at, **row} for row in rows]
     print(*rows, sep="\n", flush=True)
     return rows
 
 
-def measure(folder: Path, work: Path) -> list[Row]:
-    frames, before = list(flown(folder / "raster" / "after.vrt")), folder / "raster" / "before.vrt"
-    rasters = [coarser(before, work / f"{pixel_m:g} m.tif", pixel_m) for pixel_m in RESOLUTIONS_M]
-    cuttings = [Cutting(rasters[0], told, at) for at in ((1.0,), _FOOTPRINT_SHARES) for told in TOLD]
-    cuttings += [Cutting(raster, 1.0, (1.0,)) for raster in rasters[1:]]
+def measure_maps(folder: Path, work: Path) -> list[Row]:
+    frames, before = list(render_flight(folder / "raster" / "after.vrt")), folder / "raster" / "before.vrt"
+    rasters = [write_coarser_raster(before, work / f"{pixel_m:g} m.tif", pixel_m) for pixel_m in RESOLUTIONS_M]
+    shares = ((1.0,), _FOOTPRINT_SHARES)
+    cuts = [MapCut(rasters[0], scale, own_shares) for own_shares in shares for scale in FOOTPRINT_SCALES]
+    cuts += [MapCut(raster, 1.0, (1.0,)) for raster in rasters[1:]]
     with ProcessPoolExecutor() as pool:
-        waiting = [pool.submit(measured, cutting, folder, work, frames) for cutting in cuttings]
-        return [row for each in waiting for row in each.result()]
+        jobs = [pool.submit(measure_map, cut, folder, work, frames) for cut in cuts]
+        return [row for job in jobs for row in job.result()]
 
 
 def main() -> None:
-    (folder,) = base.find_sets(names=[SET])
+    (folder,) = base.find_sets(names=[SET_NAME])
     with tempfile.TemporaryDirectory(prefix="edgevpr-space-") as work:
-        found = {**base.made_by(), "rows": measure(folder, Path(work))}
-    base.write("from_space", found, page(found))
+        result = {**base.describe_run(), "rows": measure_maps(folder, Path(work))}
+    base.write("from_space", result, format_page(result))
 
 
-def page(found: Row) -> str:
+def format_page(result: Row) -> str:
     return f"""# Maps of a picture from space
 
-{base.told(__doc__)}
+{base.strip_title(__doc__)}
 
 Right: the place named first is within half a footprint ({FOOTPRINT_M:.0f} m). Errors: median / 90 % of the accepted.
 
-{base.table(found["rows"], _COLUMNS)}
+{base.format_table(result["rows"], _COLUMNS)}
 
-{base.made_line(found, "make from-space")}
+{base.format_origin(result, "make from-space")}
 """
 
 

@@ -32,23 +32,23 @@ def main() -> None:
         _, run, count = PARTS[name]
         print(f"trying: {name}", flush=True)
         rows = [asdict(row) if is_dataclass(row) else row for row in run(count, args.seed)]
-        found = base.read("hostile") | {name: {**base.made_by(), "seed": args.seed, "rows": rows}}
-        base.write("hostile", found, page(found))
+        result = base.read("hostile") | {name: {**base.describe_run(), "seed": args.seed, "rows": rows}}
+        base.write("hostile", result, format_page(result))
 
 
-def page(found: Row) -> str:
+def format_page(result: Row) -> str:
     """Return the page for people: a table for each part, with the fields of its rows as columns."""
     parts = ["# Tried as a hostile world would\n\nMade by `make hostile`: all inputs come from a seed."]
     for name, (title, _, _) in PARTS.items():
-        if part := found.get(name):
-            made = f"{part['date']}, commit {part['commit']}, seed {part['seed']}, {part['machine']['cpu']}."
-            rows = [{key: _shown(value) for key, value in row.items()} for row in part["rows"]]
+        if part := result.get(name):
+            origin = f"{part['date']}, commit {part['commit']}, seed {part['seed']}, {part['machine']['cpu']}."
+            rows = [{key: _format_value(value) for key, value in row.items()} for row in part["rows"]]
             columns = {key.replace("_", " "): f"{{{key}}}" for key in rows[0]}
-            parts.append(f"## {title}\n\n{made}\n\n{base.table(rows, columns)}")
+            parts.append(f"## {title}\n\n{origin}\n\n{base.format_table(rows, columns)}")
     return "\n\n".join(parts)
 
 
-def _shown(value: object) -> str:
+def _format_value(value: object) -> str:
     """Return a figure in three digits, and of counts by reason those that are not 0."""
     if isinstance(value, float):
         return f"{value:.3g}"

@@ -25,50 +25,49 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
 _PLACES = 12
-_ASKED = (0, 5, 11)  # numbers of the pictures that each map is asked for
-_PAGE = 4096
+_QUERY_NUMBERS = (0, 5, 11)  # numbers of the pictures that each map is asked for
+_PAGE_BYTES = 4096
 _COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
 
 Rng = np.random.Generator
 
 
-def _bits(path: Path, rng: Rng, first: int = 0, end: int | None = None, most: int = 64) -> None:
+def _flip_bits(path: Path, rng: Rng, first: int = 0, end: int | None = None, most: int = 64) -> None:
     data = bytearray(path.read_bytes())
-    for at in rng.integers(first, end or len(data), rng.integers(1, most + 1)):
-        data[at] ^= 1 << int(rng.integers(8))
+    for offset in rng.integers(first, end or len(data), rng.integers(1, most + 1)):
+        data[offset] ^= 1 << int(rng.integers(8))
     path.write_bytes(data)
 
 
-def _pages(path: Path, rng: Rng) -> None:
-    data = bytearray(path.read_bytes())
-    for page in rng.integers(0, len(data) // _PAGE, rng.integers(1, 6)):
-        start = int(page) * _PAGE
-        other = int(rng.integers(0, len(data) // _PAGE)) * _PAGE
-        data[start : start + _PAGE] = (rng.bytes(_PAGE), bytes(_PAGE), data[other : other + _PAGE])[rng.integers(3)]
-    path.write_bytes(data)
+def _overwrite_pages(path: Path, rng: Rng) -> None:
+    data = path.read_bytes()
+    pages = [data[start : start + _PAGE_BYTES] for start in range(0, len(data), _PAGE_BYTES)]
+    for number in rng.integers(0, len(pages), rng.integers(1, 6)):
+        other = pages[rng.integers(0, len(pages))]
+        pages[number] = (rng.bytes(_PAGE_BYTES), bytes(_PAGE_BYTES), other)[rng.integers(3)]
+    path.write_bytes(b"".join(pages))
 
 
-def _position(path: Path, rng: Rng) -> None:
+def _flip_position_bits(path: Path, rng: Rng) -> None:
     """Flip bits of positions in the file, which no trigger sees."""
     data = bytearray(path.read_bytes())
     number = int(rng.integers(_PLACES))
-    at = data.find(encode_point(*_where(number)))
-    while at >= 0:  # also where SQLite has left an old copy of the page
-        data[at + 13 + int(rng.integers(16))] ^= 1 << int(rng.integers(8))
-        at = data.find(encode_point(*_where(number)), at + 1)
+    offset = data.find(encode_point(*_locate(number)))
+    while offset >= 0:  # also where SQLite has left an old copy of the page
+        data[offset + 13 + int(rng.integers(16))] ^= 1 << int(rng.integers(8))
+        offset = data.find(encode_point(*_locate(number)), offset + 1)
     path.write_bytes(data)
 
 
 KINDS: dict[str, Callable[[Path, Rng], None]] = {
-    "bits flipped": _bits,
-    "bits of the header flipped": lambda path, rng: _bits(path, rng, 0, 100, most=3),
-    "pages overwritten": _pages,
+    "bits flipped": _flip_bits,
+    "bits of the header flipped": lambda path, rng: _flip_bits(path, rng, 0, 100, most=3),
+    "pages overwritten": _overwrite_pages,
     "cut": lambda path, rng: os.truncate(path, int(rng.random() * path.stat().st_size)),
-    "bits of a position flipped": _position,
+    "bits of a position flipped": _flip_position_bits,
 }
 
 
@@ -85,11 +84,11 @@ def run(count: int, seed: int) -> list[Row]:
             shutil.copyfile(whole, path)
             KINDS[row["kind"]](path, np.random.default_rng((seed, number)))
             with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                found = _tried(path, whole)
-            for key, value in {"tried": 1, **found}.items():
+                counts = _try_map(path, whole)
+            for key, value in {"tried": 1, **counts}.items():
                 row[key] += value
-            for each in folder.glob(path.name + "*"):
-                each.unlink()
+            for file in folder.glob(path.name + "*"):
+                file.unlink()
     return rows
 
 
@@ -97,85 +96,76 @@ def make_whole_map(path: Path) -> Path:
     """Make the map that is damaged: a few places of random pictures, small and quick."""
     technique = create("cohog", {"w1": 208})
     with PlaceMap.create(path, technique.spec) as place_map:
-        build_map(map(_frame, range(_PLACES)), FrameEncoder(technique=technique), place_map)
+        build_map(map(_make_frame, range(_PLACES)), FrameEncoder(technique=technique), place_map)
     return path
 
 
-def _where(number: int) -> tuple[float, float]:
+def _locate(number: int) -> tuple[float, float]:
     return 50 + number / 1000, 8.0
 
 
-def _frame(number: int) -> Frame:
+def _make_frame(number: int) -> Frame:
     noise = np.random.default_rng(number).integers(0, 256, (60, 80), np.uint8)
     image = cv2.resize(noise, (320, 240), interpolation=cv2.INTER_CUBIC)
-    return Frame(image=image, name=f"{number}.png", t_mono_s=float(number), position=Position(*_where(number)))
+    return Frame(image=image, name=f"{number}.png", t_mono_s=float(number), position=Position(*_locate(number)))
 
 
 _BOARD = load_board("this")
 
 
-def _tried(path: Path, whole: Path) -> Row:
+def _try_map(path: Path, whole: Path) -> Row:
     """Return tracebacks, wrong positions and places lost of one damaged map."""
     config, tracebacks, wrong, lost = load_config(None, {"map": str(path)}), 0, 0, 0
     damaged = path.read_bytes()
-    tries = (lambda: _in_flight(config, path, whole, damaged), lambda: _at_take_off(config))
-    for each in tries:
-        path.write_bytes(damaged)
+    for is_flying in (True, False):
+        shutil.copyfile(whole, path)
         try:
-            wrong += each()
+            wrong += _count_wrong_positions(config, path, damaged, is_flying)
         except EdgevprError:
             pass
         except Exception:
             tracebacks += 1
     path.write_bytes(damaged)
-    readable = _rows_of(path, whole)
+    readable = _read_intact_ids(path, whole)
     for words in (("info",), ("check",), ("check", "--json"), ("repair",)):
         try:
             main(["map", words[0], str(path), *words[1:]])
         except Exception:
             tracebacks += 1
     if path.with_name(path.name + ".damaged").exists():
-        lost = len(readable - _rows_of(path, whole))
+        lost = len(readable - _read_intact_ids(path, whole))
     return {"tracebacks": tracebacks, "wrong_positions": wrong, "places_lost": lost}
 
 
-def _asked(recogniser: Recogniser) -> int:
-    """Ask for some pictures twice; return how many were accepted at a wrong position."""
-    wrong = 0
-    for number in (*_ASKED, *_ASKED):
-        event = recogniser.step(_frame(number))
-        here = event.position  # set for an accepted match only; a fix carries no altitude
-        wrong += here is not None and (here.lat_deg, here.lon_deg) != _where(number)
-        if event.reason.code is ReasonCode.UNEXPECTED_ERROR:
-            raise AssertionError(str(event.reason))
+def _count_wrong_positions(config: Config, path: Path, damaged: bytes, is_flying: bool) -> int:
+    """Damage a whole map, before take-off or in flight, and match some pictures twice; return how many were accepted
+    at a wrong position."""
+    if not is_flying:
+        path.write_bytes(damaged)
+    recogniser, wrong = open_recogniser(config, _BOARD, uses_hints=True), 0
+    with recogniser.place_map:
+        if is_flying:
+            if not recogniser.step(_make_frame(3)).accepted:
+                raise AssertionError("a whole map must be recognised in")
+            path.write_bytes(damaged)
+        for number in (*_QUERY_NUMBERS, *_QUERY_NUMBERS):
+            event = recogniser.step(_make_frame(number))
+            position = event.position  # set for an accepted match only; a fix carries no altitude
+            wrong += position is not None and (position.lat_deg, position.lon_deg) != _locate(number)
+            if event.reason.code is ReasonCode.UNEXPECTED_ERROR:
+                raise AssertionError(str(event.reason))
     return wrong
 
 
-def _at_take_off(config: Config) -> int:
-    recogniser = open_recogniser(config, _BOARD, uses_hints=True)
-    with recogniser.place_map:
-        return _asked(recogniser)
-
-
-def _in_flight(config: Config, path: Path, whole: Path, damaged: bytes) -> int:
-    shutil.copyfile(whole, path)
-    recogniser = open_recogniser(config, _BOARD, uses_hints=True)
-    with recogniser.place_map:
-        if not recogniser.step(_frame(3)).accepted:
-            raise AssertionError("a whole map must be recognised in")
-        path.write_bytes(damaged)
-        return _asked(recogniser)
-
-
-def _rows_of(path: Path, whole: Path) -> set[int]:
+def _read_intact_ids(path: Path, whole: Path) -> set[int]:
     """Return the ids of the places that are in a map as in the whole one, read one by one with plain SQLite."""
     columns = ", ".join((*_COLUMNS, "geom_crc32", "coarse_crc32", "fine_crc32"))
     same = set()
-    with contextlib.closing(sqlite3.connect(path)) as db, contextlib.closing(sqlite3.connect(whole)) as right:
+    with contextlib.closing(sqlite3.connect(path)) as db, contextlib.closing(sqlite3.connect(whole)) as original:
         db.set_progress_handler(lambda: 1, 1_000_000)  # a view need not end
         for place_id in range(1, _PLACES + 1):
-            asked = f"SELECT {columns} FROM places WHERE place_id = {place_id}"
+            query = f"SELECT {columns} FROM places WHERE place_id = {place_id}"
             with contextlib.suppress(sqlite3.Error, UnicodeDecodeError):
-                if db.execute(asked).fetchone() == right.execute(asked).fetchone():
+                if db.execute(query).fetchone() == original.execute(query).fetchone():
                     same.add(place_id)
     return same

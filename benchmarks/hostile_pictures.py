@@ -17,9 +17,10 @@ import base
 import cv2
 import numpy as np
 import walks
-from base import DATA, Row, camera_of
+from base import Row, infer_camera
 from pictures_of_nothing import SPOILT, draw_display, overlay_figures, yield_pictures, yield_spoilt
 
+from edgevpr.core.arrays import Image
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.mapmaking.mapping import build_map
@@ -29,54 +30,56 @@ from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-Asked = tuple[str, np.ndarray, frozenset[str]]  # a kind, a picture, and the references that it may be taken for
-Draw = Callable[[np.ndarray], np.ndarray]
+Query = tuple[str, Image, frozenset[str]]  # a kind, a picture, and the references that it may be taken for
+Draw = Callable[[Image], Image]
+Rng = np.random.Generator
 
 
-def run(count: int, seed: int, data: Path = DATA, names: Iterable[str] | None = None) -> list[Row]:
-    """Ask about `count` pictures of each kind in the map of every set of `data` (or of those named); count what is
+def run(count: int, seed: int, names: Iterable[str] | None = None) -> list[Row]:
+    """Ask about `count` pictures of each kind in the map of every set (or of those named); count what is
     accepted, right or wrong, by kind and set."""
-    folders, rows = base.find_sets(data), []
+    folders, rows = base.find_sets(), []
     for number, folder in enumerate(folders):
         if names is not None and folder.name not in names:
             continue
-        dataset, rng = walks.dataset_of(folder), np.random.default_rng((seed + number, 1))
+        dataset, rng = walks.load_matched_set(folder), np.random.default_rng((seed + number, 1))
         counts: dict[str, Row] = {}
-        _ask(folder, _bare(dataset, folders, count, rng, seed + number), counts)
+        _ask_map(folder, _yield_plain(dataset, folders, count, rng, seed + number), counts)
         shape = read_image(dataset.queries[0].path).shape[:2]
         for what, over in (("a display", draw_display), ("figures", overlay_figures)):
-            draw = partial(_drawn, shape=shape, over=over, seed=seed + number)
-            asked = _behind(dataset, folders, count, rng, draw)
-            _ask(folder, ((f"{kind} behind {what}", image, may_be) for kind, image, may_be in asked), counts, draw)
-        where = {"set": folder.name, "camera": camera_of(folder.name)}
-        rows += [{"kind": kind, **where, **of_kind} for kind, of_kind in counts.items()]
+            draw = partial(_draw_overlay, shape=shape, over=over, seed=seed + number)
+            queries = _yield_overlaid(dataset, folders, count, rng, draw)
+            renamed = ((f"{kind} behind {what}", image, right) for kind, image, right in queries)
+            _ask_map(folder, renamed, counts, draw)
+        fields = {"set": folder.name, "camera": infer_camera(folder.name)}
+        rows += [{"kind": kind, **fields, **numbers} for kind, numbers in counts.items()]
     return rows
 
 
-def mapped(folder: Path, temporary: Path, draw: Draw | None = None) -> Recogniser:
+def open_set_map(folder: Path, temporary: Path, draw: Draw | None = None) -> Recogniser:
     """Map the references of a set, with `draw` as it makes them, with `cohog`, and open the map as a flight does."""
-    path, camera = temporary / "m.gpkg", camera_of(folder.name)
-    technique, frames = walks.cohog(camera), walks.frames_of(folder / "ref")
+    path, camera = temporary / "m.gpkg", infer_camera(folder.name)
+    technique, frames = walks.make_cohog(camera), walks.read_folder_frames(folder / "ref")
     with PlaceMap.create(path, technique.spec) as place_map:
-        drawn = (replace(frame, image=draw(frame.image)) for frame in frames) if draw else frames
-        build_map(drawn, FrameEncoder(technique=technique), place_map)
-    return open_recogniser(walks.config(map=str(path), **{"source.camera": camera}), load_board("this"))
+        overlaid = (replace(frame, image=draw(frame.image)) for frame in frames) if draw else frames
+        build_map(overlaid, FrameEncoder(technique=technique), place_map)
+    return open_recogniser(walks.make_config(map=str(path), **{"source.camera": camera}), load_board("this"))
 
 
-def _ask(folder: Path, asked: Iterator[Asked], counts: dict[str, Row], draw: Draw | None = None) -> None:
+def _ask_map(folder: Path, queries: Iterator[Query], counts: dict[str, Row], draw: Draw | None = None) -> None:
     """Ask pictures in the map of a set, and add to the counts of their kinds what is accepted."""
     with tempfile.TemporaryDirectory(prefix="edgevpr-hostile-") as temporary:
-        recogniser = mapped(folder, Path(temporary), draw)
+        recogniser = open_set_map(folder, Path(temporary), draw)
         with recogniser.place_map:
-            for kind, image, may_be in asked:
-                event = recogniser.step(walks.frame(image, kind))
-                of_kind = counts.setdefault(kind, {"tried": 0, "accepted": 0, "accepted_wrong": 0})
-                of_kind["tried"] += 1
-                of_kind["accepted"] += event.accepted
-                of_kind["accepted_wrong"] += event.accepted and event.best.place.source_image not in may_be
+            for kind, image, may_be in queries:
+                event = recogniser.step(walks.make_frame(image, kind))
+                count = counts.setdefault(kind, {"tried": 0, "accepted": 0, "accepted_wrong": 0})
+                count["tried"] += 1
+                count["accepted"] += event.accepted
+                count["accepted_wrong"] += event.accepted and event.best.place.source_image not in may_be
 
 
-def _bare(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Generator, seed: int) -> Iterator[Asked]:
+def _yield_plain(dataset: Dataset, folders: list[Path], count: int, rng: Rng, seed: int) -> Iterator[Query]:
     for _, image in yield_pictures(seed, count):
         yield "of nothing", image, frozenset()
     queries = -(-count // len(SPOILT))
@@ -85,23 +88,22 @@ def _bare(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Gene
         for _, image in yield_spoilt(seed + int(number), read_image(query.path)):
             yield "spoilt", image, query.correct | query.ignored
     for kind, same_camera in (("of other sites", True), ("of the other camera", False)):
-        for image in _foreign(dataset, folders, count, rng, same_camera):
+        for image in _yield_foreign(dataset, folders, count, rng, same_camera):
             yield kind, image, frozenset()
 
 
-def _behind(dataset: Dataset, folders: list[Path], count: int, rng: np.random.Generator, draw: Draw) -> Iterator[Asked]:
+def _yield_overlaid(dataset: Dataset, folders: list[Path], count: int, rng: Rng, draw: Draw) -> Iterator[Query]:
     for query in dataset.queries[:: -(-len(dataset.queries) // count)]:
         yield "its own", draw(read_image(query.path)), query.correct | query.ignored
-    for image in _foreign(dataset, folders, count, rng, same_camera=True):
+    for image in _yield_foreign(dataset, folders, count, rng, same_camera=True):
         yield "of other sites", draw(image), frozenset()
 
 
-def _foreign(
-    dataset: Dataset, folders: list[Path], count: int, rng: np.random.Generator, same_camera: bool
-) -> Iterator[np.ndarray]:
+def _yield_foreign(dataset: Dataset, folders: list[Path], count: int, rng: Rng, same_camera: bool) -> Iterator[Image]:
     """Yield pictures of other sets, by a camera that looks the same way or the other; one asked again is turned."""
     own = dataset.queries[0].path.parent.parent
-    others = [each for each in folders if (camera_of(each.name) == camera_of(own.name)) == same_camera and each != own]
+    camera = infer_camera(own.name)
+    others = [folder for folder in folders if (infer_camera(folder.name) == camera) == same_camera and folder != own]
     paths = [path for other in others for part in ("query", "ref") for path in list_images(other / part)]
     order = rng.permutation(len(paths))
     for number in range(count):
@@ -109,7 +111,7 @@ def _foreign(
         yield np.ascontiguousarray(np.rot90(read_image(path), turns))
 
 
-def _drawn(picture: np.ndarray, shape: tuple[int, int], over: Callable[..., np.ndarray], seed: int) -> np.ndarray:
+def _draw_overlay(picture: Image, shape: tuple[int, int], over: Callable[..., Image], seed: int) -> Image:
     """Return the middle of a picture as one of this shape, (height, width), in colour, with what `over` draws."""
     (height, width), larger = shape, max(shape[0] / picture.shape[0], shape[1] / picture.shape[1])
     picture = cv2.resize(picture, None, fx=larger, fy=larger, interpolation=cv2.INTER_AREA)

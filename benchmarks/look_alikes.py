@@ -18,40 +18,40 @@ from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.evidence import CHANCE_INLIERS, count_neighbours
 
 SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
-_BESIDE_LEFT_OUT = 8  # places along a way
+_NEIGHBOURS_LEFT_OUT = 8  # places along a way
 _COLUMNS = {name: f"{{{name}}}" for name in ("set", "queries", "right", "unproven", "wrong", "left_out")}
 
 
-def measure(name: str) -> base.Row:
+def measure_set(name: str) -> base.Row:
     """Ask all queries of one set."""
     folder = DATA / name
-    dataset = walks.dataset_of(folder)
+    dataset = walks.load_matched_set(folder)
     row: base.Row = {"set": name, "queries": len(dataset.queries), "right": 0, "unproven": 0, "wrong": 0, "left_out": 0}
     with walks.make_map(folder, images=folder / "ref") as (place_map, index, technique):
         calibration = read_calibration_for(place_map)
-        beside = _BESIDE_LEFT_OUT if count_neighbours(calibration.look_alikes if calibration else None) else 0
-        walk, slots = walks.walk(place_map, index, technique), np.arange(len(index))
-        with_landmarks = walks.walk(place_map, index, technique, all_evidence=True)
+        neighbours = _NEIGHBOURS_LEFT_OUT if count_neighbours(calibration.look_alikes if calibration else None) else 0
+        walk, slots = walks.make_walk(place_map, index, technique), np.arange(len(index))
+        with_landmarks = walks.make_walk(place_map, index, technique, all_evidence=True)
         for query in dataset.queries:
-            event = walk.step(walks.frame(query.path))
+            event = walk.step(walks.make_frame(query.path))
             if event.accepted:
-                found = event.best.place.source_image
-                is_right = found in query.correct or found in query.ignored
+                image = event.best.place.source_image
+                is_right = image in query.correct or image in query.ignored
                 row["right" if is_right else "wrong"] += 1
-                landmarks = with_landmarks.step(walks.frame(query.path)).evidence.landmarks
+                landmarks = with_landmarks.step(walks.make_frame(query.path)).evidence.landmarks
                 row["unproven"] += is_right and landmarks <= np.log1p(CHANCE_INLIERS)
             right_slots = [slot for slot in slots if dataset.references[slot] in {*query.correct, *query.ignored}]
-            away = [outside_neighbourhood(index, slot, slots, 0.0, max_slots=beside) for slot in right_slots]
-            kept = np.all(away, axis=0)
-            without = walks.walk(place_map, index.select(kept), technique, rule=walk.rule)
-            row["left_out"] += without.step(walks.frame(query.path)).accepted
+            masks = [outside_neighbourhood(index, slot, slots, 0.0, max_slots=neighbours) for slot in right_slots]
+            rest = index.select(np.all(masks, axis=0))
+            without = walks.make_walk(place_map, rest, technique, rule=walk.rule)
+            row["left_out"] += without.step(walks.make_frame(query.path)).accepted
     return row
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", default=",".join(SETS), help="names of sets, comma-separated")
-    print(base.table([measure(name) for name in parser.parse_args().sets.split(",")], _COLUMNS))
+    print(base.format_table([measure_set(name) for name in parser.parse_args().sets.split(",")], _COLUMNS))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,9 @@ from closed_loop import ClosedLoop
 
 from edgevpr.runtime.flight import navigator
 
-SETTLED_S, FLOWN_S, LONG_S = 40.0, 120.0, 1800.0
+SETTLE_DURATION_S = 40.0
+FLIGHT_DURATION_S = 120.0
+LONG_FLIGHT_DURATION_S = 1800.0
 ODOMETRY = {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}
 SET_UPS = {
     "GPS_INPUT": ("arducopter", {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}),
@@ -30,38 +32,38 @@ CHANGES = {
     **{f"camera tilted by {tilt_deg:g} degrees": {"mount_tilt_deg": tilt_deg} for tilt_deg in (-5.0, -2.0, 2.0, 5.0)},
 }
 FACTORS = (1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0)
-SWEPT = ("nothing", "answers 1 s late", "times +0.3 s wrong", "strides 0.7 times as long")
-SET_2 = 42007  # MAV_CMD_SET_EKF_SOURCE_SET
+FACTOR_CHANGES = ("nothing", "answers 1 s late", "times +0.3 s wrong", "strides 0.7 times as long")
+MAV_CMD_SET_EKF_SOURCE_SET = 42007  # MAV_CMD_SET_EKF_SOURCE_SET
 
 
-def without_gps(name: str, changes: dict[str, float]) -> dict[str, float]:
+def fly_without_gps(name: str, changes: dict[str, float]) -> dict[str, float]:
     """Fly by our stream alone, GPS lost, a match each second; return the largest distances, metres."""
     vehicle, parameters = SET_UPS[name]
-    flight = ClosedLoop(vehicle, **parameters).fly(SETTLED_S)
+    flight = ClosedLoop(vehicle, **parameters).fly(SETTLE_DURATION_S)
     for field, value in changes.items():
         setattr(flight, field, value)
     if parameters == ODOMETRY:
-        flight.command(SET_2, 2)
-    return worst(flight.set("SIM_GPS1_ENABLE", 0), FLOWN_S)
+        flight.command(MAV_CMD_SET_EKF_SOURCE_SET, 2)
+    return fly_and_measure(flight.set("SIM_GPS1_ENABLE", 0), FLIGHT_DURATION_S)
 
 
-def beside_gps(every: int | None) -> dict[str, float]:
-    """Fly half an hour by our ODOMETRY alone while GPS is good, with each `every`-th frame matched (None: none)."""
-    flight = ClosedLoop("arducopter", matches=every is not None, **ODOMETRY).fly(SETTLED_S)
-    flight.match_every = every or 1
-    flight.command(SET_2, 2)
-    return worst(flight, LONG_S)
+def fly_with_gps(match_every: int | None) -> dict[str, float]:
+    """Fly half an hour by our ODOMETRY alone while GPS is good, a match every `match_every` frames (None: none)."""
+    flight = ClosedLoop("arducopter", matches=match_every is not None, **ODOMETRY).fly(SETTLE_DURATION_S)
+    flight.match_every = match_every or 1
+    flight.command(MAV_CMD_SET_EKF_SOURCE_SET, 2)
+    return fly_and_measure(flight, LONG_FLIGHT_DURATION_S)
 
 
-def with_factor(name: str, factor: float) -> list[float]:
+def fly_with_factor(name: str, factor: float) -> list[float]:
     """Fly with this factor of the claimed accuracy; return the largest distance by each change of SWEPT, metres."""
     shipped, navigator.CORRELATION_FACTOR = navigator.CORRELATION_FACTOR, factor
-    flown = [without_gps(name, CHANGES[changed]) for changed in SWEPT]
+    flights = [fly_without_gps(name, CHANGES[changed]) for changed in FACTOR_CHANGES]
     navigator.CORRELATION_FACTOR = shipped
-    return [max(row["away_m"], row["away_later_m"]) for row in flown]
+    return [max(row["away_m"], row["away_later_m"]) for row in flights]
 
 
-def worst(flight: ClosedLoop, seconds: float) -> dict[str, float]:
+def fly_and_measure(flight: ClosedLoop, seconds: float) -> dict[str, float]:
     """Fly on, and return the largest distances in each half of it: of the aircraft from its target, and of the
     autopilot's estimate from the truth."""
     begin_s = flight.now_s
@@ -75,7 +77,7 @@ def worst(flight: ClosedLoop, seconds: float) -> dict[str, float]:
     }
 
 
-def page(rows: list[dict], factors: list[dict]) -> str:
+def format_page(rows: list[dict], factors: list[dict]) -> str:
     """Return the page of the results."""
     columns = {
         "positions by": "{set_up}",
@@ -84,7 +86,7 @@ def page(rows: list[dict], factors: list[dict]) -> str:
         "away, second half": "{away_later_m:.1f}",
         "estimate": "{error_m:.1f}",
     }
-    swept = {changed: f"{{worst_m[{nth}]:.1f}}" for nth, changed in enumerate(SWEPT)}
+    swept = {changed: f"{{worst_m[{nth}]:.1f}}" for nth, changed in enumerate(FACTOR_CHANGES)}
     return f"""# The loop of an autopilot that flies by edgevpr
 
 An autopilot that flies by our positions tilts with their errors, and we take its attitude. Simulated autopilots in
@@ -92,29 +94,30 @@ closed loop, a hover 60 m above ground, two minutes each: largest distance of th
 and in the second half of the flight, and of the autopilot's estimate from the truth, metres. A stable loop does not
 grow.
 
-{base.table(rows, columns, left=2)}
+{base.format_table(rows, columns, left=2)}
 
 ArduPilot takes the ten positions of a second as independent, and ours are not: they are claimed worse than they are, by
 a factor. The largest distance of the aircraft from its target, metres, by this factor (edgevpr's:
 {navigator.CORRELATION_FACTOR:.1f}). A smaller factor is the more honest claim, and lets the loop run away.
 
-{base.table(factors, {"positions by": "{set_up}", "factor": "{factor:g}", **swept})}
+{base.format_table(factors, {"positions by": "{set_up}", "factor": "{factor:g}", **swept})}
 """
 
 
 def main() -> None:
     rows = []
     for name, (changed, changes) in itertools.product(SET_UPS, CHANGES.items()):
-        rows.append({"set_up": name, "changed": f"no GPS, {changed}", **without_gps(name, changes)})
+        rows.append({"set_up": name, "changed": f"no GPS, {changed}", **fly_without_gps(name, changes)})
         print(rows[-1], flush=True)
-    for every, words in ((1, "a match each second"), (10, "a match each ten seconds"), (None, "no match")):
-        row = {"set_up": "ODOMETRY (ArduPilot)", "changed": f"30 minutes beside good GPS, {words}", **beside_gps(every)}
-        rows.append(row)
-        print(row, flush=True)
+    for match_every, words in ((1, "a match each second"), (10, "a match each ten seconds"), (None, "no match")):
+        what = {"set_up": "ODOMETRY (ArduPilot)", "changed": f"30 minutes beside good GPS, {words}"}
+        rows.append({**what, **fly_with_gps(match_every)})
+        print(rows[-1], flush=True)
     swept = itertools.product([name for name, (vehicle, _) in SET_UPS.items() if "ardu" in vehicle], FACTORS)
-    factors = [{"set_up": name, "factor": each, "worst_m": with_factor(name, each)} for name, each in swept]
-    result = {**base.made_by(), "rows": rows, "factors": factors}
-    base.write("loop", result, f"{page(rows, factors)}\n{base.made_line(result, 'python benchmarks/loop.py')}")
+    factors = [{"set_up": name, "factor": factor, "worst_m": fly_with_factor(name, factor)} for name, factor in swept]
+    result = {**base.describe_run(), "rows": rows, "factors": factors}
+    origin = base.format_origin(result, "python benchmarks/loop.py")
+    base.write("loop", result, f"{format_page(rows, factors)}\n{origin}")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from cosmic_ray.plugins import get_operator
 
 PLAN = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 WORK = base.REPOSITORY / "mutants_work"
-JOBS = int(os.environ.get("JOBS", 2))
+MAX_PROCESSES = int(os.environ.get("JOBS", 2))
 MAX_CPU_S = 60  # of the tests of one mutant; one that takes longer counts as killed
 FORK = get_context("fork")
 
@@ -62,14 +62,14 @@ def list_mutants(source: str) -> Iterator[tuple[str, str]]:
 def run_module(module: str) -> None:
     """Run the tests of a module on each of its mutants, and keep which ones were killed."""
     name, source = module.removesuffix(".py").replace("/", "."), (base.REPOSITORY / module).read_text()
-    kept = WORK / f"{Path(module).stem}.json"
+    path = WORK / f"{Path(module).stem}.json"
     pytest.main(["--collect-only", "-qq", "-p", "no:xdist", *PLAN["modules"][module]])  # loads all that is needed
-    forget(name)
-    mutants, before = dict(list_mutants(source)), json.loads(kept.read_text()) if kept.exists() else {}
+    unload_module(name)
+    mutants, before = dict(list_mutants(source)), json.loads(path.read_text()) if path.exists() else {}
     killed = {"": False} | {change: before.get(change, False) for change in mutants}  # the first is the module itself
     waiting, running = [change for change in reversed(killed) if not killed[change]], {}
     while waiting or running:
-        while waiting and len(running) < JOBS:
+        while waiting and len(running) < MAX_PROCESSES:
             change = waiting.pop()
             process = FORK.Process(target=run_tests, args=(module, name, mutants.get(change, source)))
             process.start()
@@ -81,11 +81,11 @@ def run_module(module: str) -> None:
         if killed[""]:
             sys.exit(f"{module}: its tests fail without a change")
         WORK.mkdir(exist_ok=True)
-        kept.write_text(json.dumps(killed, indent=0))
+        path.write_text(json.dumps(killed, indent=0))
     print(f"{module}: {len(mutants)} mutants, {sum(killed.values())} killed", flush=True)
 
 
-def forget(name: str) -> None:
+def unload_module(name: str) -> None:
     """Unload a module, all that import it, and the tests: they are to be loaded with the mutant."""
     users = {name, *grimp.build_graph("edgevpr", cache_dir=None).find_downstream_modules(name)}
     for other, module in list(sys.modules.items()):
@@ -124,9 +124,9 @@ def write_page() -> None:
     total = {name: sum(row[name] for row in rows) for name in ("mutants", "killed")}
     rows = [{**row, "share": row["killed"] / row["mutants"]} for row in [*rows, {"module": "all", **total}]]
     columns = {"module": "{module}", "mutants": "{mutants}", "killed": "{killed}", "share": "{share:.1%}"}
-    parts = ["# Mutants", base.told(__doc__), base.table(rows, columns), "## Survivors"]
+    parts = ["# Mutants", base.strip_title(__doc__), base.format_table(rows, columns), "## Survivors"]
     parts += [f"{why}:\n\n" + "\n".join(lines) for why, lines in survivors.items() if lines]
-    page = "\n\n".join([*parts, base.made_line(base.made_by(), "make mutants")])
+    page = "\n\n".join([*parts, base.format_origin(base.describe_run(), "make mutants")])
     (base.RESULTS / "mutants.md").write_text(page + "\n")
 
 

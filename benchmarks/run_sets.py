@@ -13,12 +13,11 @@ import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import base
-import numpy as np
 import sets_page
 import yaml
+from base import Row
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_position
@@ -41,9 +40,11 @@ LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FI
 # Rows that no board is offered: other weights, another way to match or to ask, or a comparison with everything.
 NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights", "known", "followed")
 # Of a set whose sites have no positions on Earth: where they are said to be, how far apart, and the size of a pixel.
-_FIRST_SITE, _SITES_APART_M, _PIXEL_M = (37.0, 36.0), 20_000.0, 0.5
+_FIRST_SITE_DEG = (37.0, 36.0)
+_SITE_SPACING_M = 20_000.0
+_PIXEL_M = 0.5
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
-_POINTS = 25  # of a curve that is kept
+_MAX_CURVE_POINTS = 25  # that are kept: a curve is only drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,13 +92,13 @@ def main(argv: list[str] | None = None) -> None:
         folders = [
             folder
             if not (folder / "sites.csv").exists()
-            else placed(folder, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-placed-"))))
+            else place_sites(folder, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-placed-"))))
             for folder in folders
         ]
-        from_the_air = [folder for folder in folders if base.camera_of(folder.name) == "nadir"]
+        from_the_air = [folder for folder in folders if base.infer_camera(folder.name) == "nadir"]
         if len(from_the_air) > 1:
             folders.append(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-joined-"))) / JOINED)
-            join(from_the_air, folders[-1])
+            join_sets(from_the_air, folders[-1])
         weights = base.REPOSITORY.parent / "shared" / "models" / "calc" / "model.onnx"
         if ORIGINAL_CALC in wanted and weights.is_file():
             write_original_calc(
@@ -111,10 +112,11 @@ def main(argv: list[str] | None = None) -> None:
                 write_set(args.out / f"{folder.name}.json", folder, rows)
     if args.out.resolve() == base.RESULTS:  # figures of other sets, or of a trial, do not travel
         write_accuracy(sets_page.read_sets(args.out))
-    sets_page.write(args.out, {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT})
+    left_out = {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT}
+    sets_page.write_page(args.out, left_out)
 
 
-def placed(folder: Path, work: Path) -> Path:
+def place_sites(folder: Path, work: Path) -> Path:
     """Make a copy in `work` of a set that says in sites.csv where its pictures lie in those of their sites. It gets a
     positions.csv: within a site positions are true to the pixel, where the sites lie on Earth is invented."""
     out, sites, tags = work / folder.name, [], {}
@@ -124,14 +126,14 @@ def placed(folder: Path, work: Path) -> Path:
     for row in base.read_csv(folder / "sites.csv"):
         if row["site"] not in sites:
             sites.append(row["site"])
-        site = offset_position(*_FIRST_SITE, _SITES_APART_M * sites.index(row["site"]), 0.0)
+        site = offset_position(*_FIRST_SITE_DEG, _SITE_SPACING_M * sites.index(row["site"]), 0.0)
         position = Position(*offset_position(*site, _PIXEL_M * float(row["x_px"]), -_PIXEL_M * float(row["y_px"])))
         tags[row["file"]] = GeoTag(position=position, heading_deg=float(row["yaw_deg"]))
     write_positions(out / "positions.csv", tags)
     return out
 
 
-def join(folders: list[Path], out: Path) -> None:
+def join_sets(folders: list[Path], out: Path) -> None:
     """Make one set of several: every query asks for its place among the places of all."""
     rows = []
     for folder in folders:
@@ -148,11 +150,11 @@ def join(folders: list[Path], out: Path) -> None:
 
 def find_variants(labels: list[str] | None) -> list[Variant]:
     """Return the variants with these labels (None: all). Raises UsageError for one that is not there."""
-    known = {variant.label: variant for variant in VARIANTS}
+    variants = {variant.label: variant for variant in VARIANTS}
     for label in labels or ():
-        if label not in known:
-            raise UsageError(f"There is no row `{label}`: use some of {'; '.join(known)}.")
-    return [variant for label, variant in known.items() if labels is None or label in labels]
+        if label not in variants:
+            raise UsageError(f"There is no row `{label}`: use some of {'; '.join(variants)}.")
+    return [variant for label, variant in variants.items() if labels is None or label in labels]
 
 
 def write_original_calc(cards: Path, weights: Path) -> None:
@@ -169,37 +171,39 @@ def write_original_calc(cards: Path, weights: Path) -> None:
 def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
     """Measure a set and write its file: rows measured before and not now stay as they are, each with its commit."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
-    rows: dict[str, Any] = sets_page.by_name(base.read(path.stem, path.parent))
-    if not (wanted := [variant for variant in wanted if can_be_asked(variant, folder, dataset)]):
+    rows: Row = sets_page.index_rows(base.read(path.stem, path.parent))
+    if not (wanted := [variant for variant in wanted if is_applicable(variant, folder, dataset)]):
         return
     for variant in wanted:
 
-        def shown(items, total, label, variant=variant):
+        def show_progress(items, total, label, variant=variant):
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
-        technique = create(variant.technique, settings(variant, folder))
-        answers, not_done = answer_queries(technique, dataset, variant.options, shown)
+        technique = create(variant.technique, make_settings(variant, folder))
+        answers, not_done = answer_queries(technique, dataset, variant.options, show_progress)
         result = summarise(technique, dataset, answers, variant.options, not_done)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
-            "precision_recall": thinned(result.precision_recall) if sets_page.is_drawn(variant.label) else [],
-            "commit": base.commit(),
+            "precision_recall": base.thin_evenly(result.precision_recall, _MAX_CURVE_POINTS)
+            if sets_page.has_curve(variant.label)
+            else [],
+            "commit": base.read_commit(),
             "cpu": provenance.read_cpu_model(),
         }
     in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
-    for row, each in zip(in_order, add_pcu(read_result(row) for row in in_order), strict=True):
-        row |= asdict(each)  # the slowest encoder of all may be another now
-    made = base.made_by()
-    content = {"set": folder.name, "use": base.use_of(folder.name), "date": made["date"], "machine": made["machine"]}
+    for row, result in zip(in_order, add_pcu(read_result(row) for row in in_order), strict=True):
+        row |= asdict(result)  # the slowest encoder of all may be another now
+    run = base.describe_run()
+    content = {"set": folder.name, "use": base.find_use(folder.name), "date": run["date"], "machine": run["machine"]}
     content["ah_assumes"] = in_order[0]["ah_assumes"]
     content["rows"] = [{key: value for key, value in row.items() if key != "ah_assumes"} for row in in_order]
     base.write_json(path.stem, content, path.parent)
 
 
-def can_be_asked(variant: Variant, folder: Path, dataset: Dataset) -> bool:
+def is_applicable(variant: Variant, folder: Path, dataset: Dataset) -> bool:
     """Return True if a set says what a variant is told of each query."""
     if not variant.options.known:
         return True
-    spec = create(variant.technique, settings(variant, folder)).spec
+    spec = create(variant.technique, make_settings(variant, folder)).spec
     try:
         read_prior(variant.options.known, dataset, spec, variant.options.sequence)
     except UsageError:
@@ -207,28 +211,23 @@ def can_be_asked(variant: Variant, folder: Path, dataset: Dataset) -> bool:
     return True
 
 
-def thinned(curve: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return at most some points of a curve, evenly spread: it is only drawn from here on."""
-    return [curve[at] for at in np.unique(np.linspace(0, len(curve) - 1, min(len(curve), _POINTS)).round().astype(int))]
-
-
-def settings(variant: Variant, folder: Path) -> dict[str, str]:
+def make_settings(variant: Variant, folder: Path) -> dict[str, str]:
     """Return how a variant is used on a set: `cohog` looks down in those from the air; the thesis's has no camera."""
     looks_down = variant.technique == "cohog" and "matching" not in variant.settings
-    return variant.settings | ({"camera": "nadir"} if looks_down and base.camera_of(folder.name) == "nadir" else {})
+    return variant.settings | ({"camera": "nadir"} if looks_down and base.infer_camera(folder.name) == "nadir" else {})
 
 
-def write_accuracy(contents: list[dict[str, Any]]) -> None:
+def write_accuracy(contents: list[Row]) -> None:
     """Write the table of how well each technique recognises, by the way the camera looks, that travels with the
     program: recall is that of the sets that are reported, what was accepted that of all."""
-    found: dict[str, dict[str, Any]] = {"forward": {}, "nadir": {}}
-    for camera, table in found.items():
-        of_camera = [each for each in contents if base.camera_of(each["set"]) == camera and each["set"] != JOINED]
-        for label in dict.fromkeys(label for each in of_camera for label in each["techniques"]):
+    accuracy: dict[str, Row] = {"forward": {}, "nadir": {}}
+    for camera, table in accuracy.items():
+        sets = [row for row in contents if base.infer_camera(row["set"]) == camera and row["set"] != JOINED]
+        for label in dict.fromkeys(label for content in sets for label in content["techniques"]):
             if not any(word in label for word in NOT_OFFERED):
-                rows = [(each["use"], each["techniques"][label]) for each in of_camera if label in each["techniques"]]
+                rows = [(row["use"], row["techniques"][label]) for row in sets if label in row["techniques"]]
                 reported, results = [row for use, row in rows if use == "report"], [row for _, row in rows]
-                recalls = [sets_page.of_matches(row) for row in reported]
+                recalls = [sets_page.select_match_figures(row) for row in reported]
                 table[label] = {
                     "recall_at_1": round(sum(row["recall_at_1"] for row in recalls) / len(recalls), 4),
                     "sets": len(recalls),
@@ -237,7 +236,7 @@ def write_accuracy(contents: list[dict[str, Any]]) -> None:
                     **{key: sum(row[key] for row in results) for key in ("accepted", "accepted_wrong")},
                     "accepted_elsewhere": sum(read_result(row).accepted_elsewhere for row in results),
                 }
-    ACCURACY.write_text(json.dumps(found, indent=1) + "\n")
+    ACCURACY.write_text(json.dumps(accuracy, indent=1) + "\n")
 
 
 if __name__ == "__main__":

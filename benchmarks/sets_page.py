@@ -2,22 +2,24 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import base
+from base import Row
 
 from edgevpr.lab.evaluate import tables
 from edgevpr.lab.evaluate.metrics import TechniqueResult, read_result
 
+Results = Mapping[str, Sequence[TechniqueResult]]  # by the name of the set
+
 CURVES = "curves.png"
-_PANELS_A_ROW = 3
-_REACHED = (*tables.RECALLS, *tables.CURVE, *tables.DECISIONS)
-_PAID = ("grief_stromovka_seasons", "aerial_swindale")  # whose costs are shown: ahead, and down
+_MAX_COLUMNS = 3  # of panels
+_QUALITY_COLUMNS = (*tables.RECALLS, *tables.CURVE, *tables.DECISIONS)
+_COST_SETS = ("grief_stromovka_seasons", "aerial_swindale")  # whose costs are shown: ahead, and down
 # More than ten colours cannot be told apart: after ten curves the line style changes.
-_LINES = ("-", "--", ":", "-.")
-FORMS = (" 8bit", " 1bit")  # of a vector
+_LINE_STYLES = ("-", "--", ":", "-.")
+FORM_SUFFIXES = (" 8bit", " 1bit")  # of a vector
 # What is drawn: forms, and what is the same technique under other conditions, would hide the rest.
-_NOT_DRAWN = (*FORMS, ", exact", ", one frame", " candidates")
+_SUFFIXES_WITHOUT_CURVE = (*FORM_SUFFIXES, ", exact", ", one frame", " candidates")
 
 _ABOUT = """\
 `cohog` is as it flies: a scan of 144 bytes a place (looking down 1120), then the displacement vote over the best
@@ -46,108 +48,105 @@ beside this page hold every figure.
 """
 
 
-def read_sets(folder: Path) -> list[dict[str, Any]]:
+def read_sets(folder: Path) -> list[Row]:
     """Read the results of all image sets in a folder."""
     contents = [base.read(path.stem, folder) for path in sorted(folder.glob("*.json"))]
-    return [{**content, "techniques": by_name(content)} for content in contents if "ah_assumes" in content]
+    return [{**content, "techniques": index_rows(content)} for content in contents if "ah_assumes" in content]
 
 
-def by_name(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def index_rows(content: Row) -> dict[str, Row]:
     """Return the rows of a file of results ({}: there is none) by the technique."""
     return {row["technique"]: {"ah_assumes": content["ah_assumes"], **row} for row in content.get("rows", ())}
 
 
-def of_matches(row: dict[str, Any]) -> dict[str, Any]:
+def select_match_figures(row: Row) -> Row:
     """Return the figures of a row of a file of the queries whose place is in the map."""
     return row["with_match"] or row
 
 
-def is_drawn(label: str) -> bool:
+def has_curve(label: str) -> bool:
     """Return whether a row has a curve."""
-    return not label.endswith(_NOT_DRAWN)
+    return not label.endswith(_SUFFIXES_WITHOUT_CURVE)
 
 
-def write(folder: Path, left_out: dict[str, str]) -> None:
+def write_page(folder: Path, left_out: dict[str, str]) -> None:
     """Sum up all files of `folder`; `left_out` says of sets that are not there why."""
     contents = read_sets(folder)
     results = {content["set"]: [read_result(row) for row in content["techniques"].values()] for content in contents}
-    drawn = {name: [each for each in rows if is_drawn(each.technique)] for name, rows in results.items()}
-    plot(drawn, folder / CURVES)
-    base.shrink(folder / CURVES)
-    (folder / "sets.md").write_text(_page(contents, results, left_out))
+    curves = {name: [result for result in rows if has_curve(result.technique)] for name, rows in results.items()}
+    plot_curves(curves, folder / CURVES)
+    (folder / "sets.md").write_text(_format_page(contents, results, left_out))
 
 
-def plot(results: Mapping[str, Sequence[TechniqueResult]], path: Path) -> None:
-    """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
-    A curve is that of all queries.
-    A curve of one point, where all scores are the same, is drawn as a mark."""
-    columns = min(len(results), _PANELS_A_ROW)
+def plot_curves(results: Results, path: Path) -> None:
+    """Draw one panel per data set with one curve of all its queries per technique, best AUC first in the legend, and
+    write them to `path`. A curve of one point, where all scores are the same, is drawn as a mark."""
+    columns = min(len(results), _MAX_COLUMNS)
     rows = -(-len(results) // columns)
-    drawn = base.figure(5.2 * columns, 4.6 * rows)
-    # A technique looks the same in every panel, whatever is beside it and whatever the order of the legend.
+    figure, axes = base.make_panels(5.2 * columns, 4.6 * rows, len(results), rows)
+    # The order of all names gives a technique the same line in every panel.
     names = list(dict.fromkeys(result.technique for compared in results.values() for result in compared))
-    for at, (title, compared) in enumerate(results.items(), start=1):
-        axes = drawn.add_subplot(rows, columns, at)
+    for axis, (title, compared) in zip(axes, results.items(), strict=True):
         for result in sorted(compared, key=lambda result: -result.auc_from_zero):
             number = names.index(result.technique)
             precision, recall = zip(*result.precision_recall, strict=True)
             label, mark = f"{result.technique} {result.auc_from_zero:.2f}", "o" if len(recall) == 1 else None
-            line, colour = _LINES[number // 10 % len(_LINES)], f"C{number % 10}"
-            axes.plot(recall, precision, line, color=colour, marker=mark, label=label)
-        axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
-        axes.grid(alpha=0.3)
+            line, colour = _LINE_STYLES[number // 10 % len(_LINE_STYLES)], f"C{number % 10}"
+            axis.plot(recall, precision, line, color=colour, marker=mark, label=label)
+        axis.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
         # Below the panel, where it hides no curve.
-        axes.legend(title="AUC", fontsize=7, title_fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13))
-    drawn.savefig(path, dpi=60)
+        axis.legend(title="AUC", fontsize=7, title_fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13))
+    base.save_figure(figure, path, dpi=60)
 
 
-def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResult]], left_out: dict[str, str]) -> str:
-    made = [
-        [content["set"], content["use"], content["date"], ", ".join(sorted({row["commit"] for row in _rows(content)}))]
-        for content in contents
+def _format_page(contents: list[Row], results: Results, left_out: dict[str, str]) -> str:
+    commits = [", ".join(sorted({row["commit"] for row in _list_rows(content)})) for content in contents]
+    origins = [
+        [content["set"], content["use"], content["date"], own_commits]
+        for content, own_commits in zip(contents, commits, strict=True)
     ]
     machine = contents[0]["machine"]
-    shown = [
+    pairs = [
         (content["set"], row)
         for content in contents
         for label, row in content["techniques"].items()
-        if not label.endswith(FORMS)
+        if not label.endswith(FORM_SUFFIXES)
     ]
-    reached = [[name, *cells] for name, row in shown for cells in tables.make_rows(read_result(row), _REACHED)]
+    reached = [[name, *cells] for name, row in pairs for cells in tables.make_rows(read_result(row), _QUALITY_COLUMNS)]
     costs = [
-        (name, row, *tables.make_rows(read_result(row), tables.COSTS, include_in_map=False)) for name, row in shown
+        (name, row, *tables.make_rows(read_result(row), tables.COSTS, include_in_map=False)) for name, row in pairs
     ]
-    paid = [[name, *cells, row["cpu"]] for name, row, cells in costs if name in _PAID]
-    old = [content["set"] for content in contents if any("unscored" not in row for row in _rows(content))]
-    weights = sorted({each.weights for rows in results.values() for each in rows if each.weights})
+    paid = [[name, *cells, row["cpu"]] for name, row, cells in costs if name in _COST_SETS]
+    old = [content["set"] for content in contents if any("unscored" not in row for row in _list_rows(content))]
+    weights = sorted({result.weights for rows in results.values() for result in rows if result.weights})
     page = f"""# Every technique on real images
 
 Made by `make results` with {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}; the table of costs names
 the machine of each row. Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
-{base.format_markdown_table(("set", "use", "date", "commit"), made)}
+{base.format_markdown_table(("set", "use", "date", "commit"), origins)}
 
 {_ABOUT}
 Weights in use:
 
-{chr(10).join(f"* {each}" for each in weights)}
+{chr(10).join(f"* {result}" for result in weights)}
 
 ## Recall@1
 
 Of the queries whose place is in the map:
 
-{overview(contents)}
+{format_recall_table(contents)}
 
 ![Precision-recall curves]({CURVES})
 
 ## Recognition
 
-{base.format_markdown_table(("set", *tables.list_headings(_REACHED)), reached)}
+{base.format_markdown_table(("set", *tables.list_headings(_QUALITY_COLUMNS)), reached)}
 
 Rows are of all queries; where some have no place in the map, those called *in map* are of the others alone. Sets that
 were measured before such queries were counted: {", ".join(old) or "none"}.
 
-{chr(10).join(f"* {each}" for each in tables.ABOUT_FIGURES)}
+{chr(10).join(f"* {result}" for result in tables.ABOUT_FIGURES)}
 * P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
   highest-scoring wrong one. EP: equation 2.4 of the thesis, as in VPR-Bench.
 * ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
@@ -169,19 +168,19 @@ were measured before such queries were counted: {", ".join(old) or "none"}.
     return page
 
 
-def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lambda label: True) -> str:
+def format_recall_table(contents: list[Row], wanted: Callable[[str], bool] = lambda label: True) -> str:
     """Recall@1 of every `wanted` technique (down) on every set (across), of the queries whose place is in the map, as a
     Markdown table."""
     rows = []
     for label in filter(wanted, dict.fromkeys(label for content in contents for label in content["techniques"])):
-        found = [content["techniques"].get(label) for content in contents]
-        sizes = sorted({row["descriptor_bytes"] for row in found if row})  # those of cohog differ by camera
-        recalls = ("-" if row is None else f"{of_matches(row)['recall_at_1']:.2f}" for row in found)
+        rows_of_sets = [content["techniques"].get(label) for content in contents]
+        sizes = sorted({row["descriptor_bytes"] for row in rows_of_sets if row})  # those of cohog differ by camera
+        recalls = ("-" if row is None else f"{select_match_figures(row)['recall_at_1']:.2f}" for row in rows_of_sets)
         rows.append([label, " or ".join(map(str, sizes)), *recalls])
-    queries = [of_matches(_rows(content)[0])["queries"] for content in contents]
-    heads = [f"{each['set']} ({each['use']}, {count})" for each, count in zip(contents, queries, strict=True)]
+    queries = [select_match_figures(_list_rows(content)[0])["queries"] for content in contents]
+    heads = [f"{content['set']} ({content['use']}, {count})" for content, count in zip(contents, queries, strict=True)]
     return base.format_markdown_table(("technique", "RAM B/place", *heads), rows)
 
 
-def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:
+def _list_rows(content: Row) -> list[Row]:
     return list(content["techniques"].values())

@@ -11,18 +11,20 @@ from edgevpr.mapmaking.calibrate import QueryResult, adapt_model, fit_logistic, 
 from edgevpr.runtime.recognise.confidence import Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES, Evidence
 
-_PULL = 0.3
+_PRIOR_WEIGHT = 0.3
 # Parts of the wrong matches that are the tail. With 0.3 of those of a site itself, the draw of the pictures that a map
 # is adapted with decided whether one tunnel of nordland_tiny was taken for another.
-_OFF_MAP, _OFF_PLACE, _STAND_IN = 0.02, 0.4, 0.2
-_MIN_WRONG = 20
-_EACH = 100.0  # the weight of the right, and of the wrong, matches of a map
-_MIN_IN_TAIL = 5
+_OFF_MAP_TAIL = 0.02
+_OFF_PLACE_TAIL = 0.4
+_STAND_IN_TAIL = 0.2
+_MIN_WRONG_MATCHES = 20
+_MAP_WEIGHT = 100.0  # the weight of the right, and of the wrong, matches of a map
+_MIN_TAIL_MATCHES = 5
 _MIN_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FittedSite:
+class SiteEvidence:
     """Evidence of one site, by its map: that of real queries, and the `answers` to changed pictures of its own.
     `own` are queries of the site with whether their match is right, `foreign` queries of other sites."""
 
@@ -32,17 +34,17 @@ class FittedSite:
     answers: Sequence[QueryResult]
 
 
-def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model:
+def fit_shipped_model(kind: str, sites: Sequence[SiteEvidence], made_of: str) -> Model:
     """Fit the model of one kind of evidence to these sites, each as important as any other."""
-    of_map = _regression(
+    of_map = _fit_regression(
         MAP_FIGURES[kind],
         [([evidence for evidence, right in site.own if right], True) for site in sites]
         + [(site.foreign, False) for site in sites],
     )
-    of_place = _regression(
+    of_place = _fit_regression(
         PLACE_FIGURES[kind],
         [
-            ([evidence for evidence, each in site.own if each == right], right)
+            ([evidence for evidence, is_right in site.own if is_right == right], right)
             for site in sites
             for right in (True, False)
         ]
@@ -57,46 +59,48 @@ def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model
     matches = sum(len(site.own) + len(site.foreign) for site in sites)
     model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of, matches=matches)
     bare = [(site, model) for site in sites]
-    own = [(site, adapt_model(model, kind, site.answers, site.name)) for site in sites if site.answers]
-    return replace(model, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
+    adapted = [(site, adapt_model(model, kind, site.answers, site.name)) for site in sites if site.answers]
+    return replace(model, scale=_fit_scale(bare), adapted_scale=_fit_scale(adapted) if adapted else None)
 
 
-def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:
+def _fit_regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:
     groups = [(rows, right) for rows, right in groups if len(rows)]
     rows = [row.figures() for group, _ in groups for row in group]
-    right = np.concatenate([np.full(len(group), each) for group, each in groups])
-    weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
+    right = np.concatenate([np.full(len(group), is_right) for group, is_right in groups])
+    weights = np.concatenate([np.full(len(group), _MAP_WEIGHT / len(group)) for group, _ in groups])
     scales = np.maximum(make_evidence_matrix(rows, names).std(0), 1e-3)
     nothing_known = Logistic(tuple(names), (0.0,) * len(names), tuple(scales.tolist()), 0.0)
-    return fit_logistic(nothing_known, rows, right, weights, _PULL * len(groups))
+    return fit_logistic(nothing_known, rows, right, weights, _PRIOR_WEIGHT * len(groups))
 
 
-def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
+def _fit_scale(sites: Sequence[tuple[SiteEvidence, Model]]) -> Scale:
     """Return what the logits mean that models give at their sites. A match that does not lead is never accepted, so it
     is in no tail of `off_place`."""
     foreign = [(model, evidence) for site, model in sites for evidence in site.foreign]
     own = [(model, evidence, right) for site, model in sites for evidence, right in site.own]
     wrong = [(model, evidence) for model, evidence, right in own if not right and evidence.leads]
-    count, part = len(own), _OFF_PLACE
-    if len(wrong) < _MIN_WRONG:  # ground of other sites stands in for ground that looks alike
+    count, part = len(own), _OFF_PLACE_TAIL
+    if len(wrong) < _MIN_WRONG_MATCHES:  # ground of other sites stands in for ground that looks alike
         wrong = [(model, evidence) for model, evidence in foreign if evidence.leads]
-        count, part = len(foreign), _STAND_IN
-    off_map = _tail([model.of_map.logit(evidence.figures()) for model, evidence in foreign], len(foreign), _OFF_MAP)
-    off_place = _tail([model.of_place.logit(evidence.figures()) for model, evidence in wrong], count, part)
+        count, part = len(foreign), _STAND_IN_TAIL
+    logits = [model.of_map.logit(evidence.figures()) for model, evidence in foreign]
+    off_map = _fit_tail(logits, len(foreign), _OFF_MAP_TAIL)
+    off_place = _fit_tail([model.of_place.logit(evidence.figures()) for model, evidence in wrong], count, part)
     scale = Scale(off_map, off_place, 1.0, 0.0)
     rows, right, weights = [], [], []
     for site, model in sites:
         model = replace(model, scale=scale)
         for group in (site.own, [(evidence, False) for evidence in site.foreign]):
             rows += [{"log_chance": -math.log(max(model.chance(evidence.figures()), 1e-15))} for evidence, _ in group]
-            right += [each for _, each in group]
-            weights += [_EACH / len(group)] * len(group)
-    line = fit_logistic(Logistic(("log_chance",), (1.0,), (1.0,), 0.0), rows, np.array(right), np.array(weights), _PULL)
+            right += [is_right for _, is_right in group]
+            weights += [_MAP_WEIGHT / len(group)] * len(group)
+    prior = Logistic(("log_chance",), (1.0,), (1.0,), 0.0)
+    line = fit_logistic(prior, rows, np.array(right), np.array(weights), _PRIOR_WEIGHT)
     return replace(scale, slope=line.weights[0], offset=line.bias)
 
 
-def _tail(wrong: Sequence[float], count: int, part: float) -> Tail:
+def _fit_tail(wrong: Sequence[float], count: int, part: float) -> Tail:
     """Fit the tail of wrong matches, of `count` matches in all, to the highest `part` of their logits."""
-    highest = np.sort(wrong)[::-1][: max(_MIN_IN_TAIL, math.ceil(part * len(wrong))) + 1]
+    highest = np.sort(wrong)[::-1][: max(_MIN_TAIL_MATCHES, math.ceil(part * len(wrong))) + 1]
     start, above = float(highest[-1]), highest[:-1]
     return Tail(start, len(above) / count, max(float((above - start).mean()), _MIN_SCALE))

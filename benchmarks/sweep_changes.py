@@ -11,9 +11,10 @@ import numpy as np
 
 from edgevpr.mapmaking.changes import change_season
 
-ACROSS_DEG = 66.0  # of the camera that is supposed
-_FOG_GREY, _READ_NOISE = 200.0, 1.5
-_OF_WIDTH = 640  # blur is told in pixels of a picture of this width
+FOV_DEG = 66.0  # of the camera that is supposed
+_FOG_GREY_LEVEL = 200.0
+_READ_NOISE_SD = 1.5
+_BLUR_WIDTH_PX = 640  # blur is told in pixels of a picture of this width
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +27,7 @@ class Sweep:
     levels: tuple[float, ...]
     ahead: tuple[float, ...] | None = None
 
-    def of(self, camera: str) -> tuple[float, ...]:
+    def list_levels(self, camera: str) -> tuple[float, ...]:
         return self.ahead if self.ahead is not None and camera == "forward" else self.levels
 
 
@@ -43,11 +44,11 @@ SWEEPS = {
     "hidden": Sweep(title="occlusion", unit="of the picture", levels=(0, 0.15, 0.3, 0.5, 0.7)),
     "season": Sweep(title="season", unit="strength", levels=(0, 0.4, 0.7, 1, 1.3)),
 }
-NONE = {"height": 1, "dark": 1, "jpeg": 100}  # the level that changes nothing, where it is not 0
-OF_CAMERA = ("yaw", "pitch", "roll", "height", "shift")  # the others change the picture
+UNCHANGED_LEVELS = {"height": 1, "dark": 1, "jpeg": 100}  # the level that changes nothing, where it is not 0
+CAMERA_SWEEPS = ("yaw", "pitch", "roll", "height", "shift")  # the others change the picture
 
 
-def view(camera: str, sweep: str, level: float, size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+def make_view(camera: str, sweep: str, level: float, size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """Return the homography (3, 3) from a picture of this size (width, height) to that of the camera after the change.
     The camera turns in its place; it shifts to a random direction, ahead to the left or right."""
     turned, height, shift = {}, 1.0, np.zeros(2)
@@ -58,7 +59,7 @@ def view(camera: str, sweep: str, level: float, size: tuple[int, int], rng: np.r
     elif sweep == "shift":
         towards = rng.uniform(0, 2 * math.pi) if camera == "nadir" else rng.choice((0, math.pi))
         shift = level * np.array([math.cos(towards), math.sin(towards)]) * size
-    focal_px = size[0] / 2 / math.tan(math.radians(ACROSS_DEG / 2))
+    focal_px = size[0] / 2 / math.tan(math.radians(FOV_DEG / 2))
     centre = (np.array(size) - 1) / 2
     lens = np.array([[focal_px, 0, centre[0]], [0, focal_px, centre[1]], [0, 0, 1.0]])
     # Axes of the lens: right, down the picture, where it looks.
@@ -70,25 +71,25 @@ def view(camera: str, sweep: str, level: float, size: tuple[int, int], rng: np.r
     return lens @ turn @ onto @ np.linalg.inv(lens)
 
 
-def spoilt(sweep: str, level: float, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def degrade_image(sweep: str, level: float, image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a picture after the change, uint8. What hides a share of it is one plain patch of the picture's shape."""
-    if level == NONE.get(sweep, 0):
+    if level == UNCHANGED_LEVELS.get(sweep, 0):
         return image
     high, wide = image.shape[:2]
     if sweep == "blur":
-        return cv2.GaussianBlur(image, (0, 0), level * wide / _OF_WIDTH)
+        return cv2.GaussianBlur(image, (0, 0), level * wide / _BLUR_WIDTH_PX)
     if sweep == "jpeg":
         coded = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, int(level)))[1]
         return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
     if sweep == "hidden":
         hidden, sides = image.copy(), [round(math.sqrt(level) * side) for side in (high, wide)]
-        top, left = (rng.integers(0, side - own + 1) for side, own in zip((high, wide), sides, strict=True))
+        top, left = (rng.integers(0, side - part + 1) for side, part in zip((high, wide), sides, strict=True))
         hidden[top : top + sides[0], left : left + sides[1]] = rng.integers(0, 256)
         return hidden
     if sweep == "season":
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
         changed = 255 * change_season(grey.astype(np.float32) / 255, rng, level)
     else:
-        changed = level * image if sweep == "dark" else (1 - level) * image + level * _FOG_GREY
-        changed = changed + _READ_NOISE * rng.normal(size=image.shape)
+        changed = level * image if sweep == "dark" else (1 - level) * image + level * _FOG_GREY_LEVEL
+        changed = changed + _READ_NOISE_SD * rng.normal(size=image.shape)
     return np.clip(changed, 0, 255).round().astype(np.uint8)

@@ -12,58 +12,58 @@ import base
 import numpy as np
 import thesis_page
 from base import DATA, REPOSITORY, RESULTS
-from thesis_values import MATRICES, Results, measured_rows, read_results
+from thesis_values import MATRICES, Results, read_results, select_rows
 
 from edgevpr.lab.evaluate.dataset import list_names, read_truth
 from edgevpr.lab.evaluate.metrics import compute_quality, rank_of_first_correct
 
-SET = "corridor"
+SET_NAME = "corridor"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--page", action="store_true", help="measure nothing: page and curves of what is there")
     if not parser.parse_args().page:
-        found = matrices(DATA / "vprbench_precomputed", DATA / SET)
-        base.write_json("thesis", {**base.made_by(), "matrices": found})
+        matrices = measure_matrices(DATA / "vprbench_precomputed", DATA / SET_NAME)
+        base.write_json("thesis", {**base.describe_run(), "matrices": matrices})
     results = read_results(RESULTS)
-    curves(results, RESULTS / "thesis_curves.png")
-    (REPOSITORY / "docs" / "thesis.md").write_text(thesis_page.page(results), encoding="utf-8")
+    draw_curves(results, RESULTS / "thesis_curves.png")
+    (REPOSITORY / "docs" / "thesis.md").write_text(thesis_page.format_page(results), encoding="utf-8")
 
 
-def matrices(folder: Path, images: Path) -> dict[str, dict]:
+def measure_matrices(folder: Path, images: Path) -> dict[str, dict]:
     """Measure every stored similarity matrix of the author (a row per query, a column per reference), and add the
     times that he published with them."""
-    times = {row["technique"]: row for row in base.read_csv(folder / f"{SET}_figures.csv")}
+    times = {row["technique"]: row for row in base.read_csv(folder / f"{SET_NAME}_figures.csv")}
     references, truth = list_names(images / "ref"), read_truth(images / "ground_truth.csv")
     correct = np.array([[name in answers[0] for name in references] for answers in truth.values()])
-    found = {}
-    for path in sorted(folder.glob(f"{SET}_*.npy")):
-        name = path.stem.removeprefix(f"{SET}_")
+    figures = {}
+    for path in sorted(folder.glob(f"{SET_NAME}_*.npy")):
+        name = path.stem.removeprefix(f"{SET_NAME}_")
         published = {key: float(times[name][key]) for key in ("t_encode_s", "t_match_per_ref_s")}
         scores = np.load(path)
         orders = np.argsort(-scores, axis=1, kind="stable")
         ranks = np.array([rank_of_first_correct(*row) for row in zip(orders, correct, strict=True)])
         quality = compute_quality(scores.max(axis=1), ranks, correct.any(axis=1))
-        found[name] = {"technique": name, "references": len(references), "unscored": 0, **quality, **published}
-    return found
+        figures[name] = {"technique": name, "references": len(references), "unscored": 0, **quality, **published}
+    return figures
 
 
-def curves(results: Results, path: Path) -> None:
+def draw_curves(results: Results, path: Path) -> None:
     """Draw the PR curves of the author's matrices of corridor, and those of the techniques here."""
-    theirs = {name: results.thesis["matrices"][of] for name, of in MATRICES.items()}
-    ours = measured_rows(results, "corridor")
+    theirs = {name: results.thesis["matrices"][matrix] for name, matrix in MATRICES.items()}
+    ours = select_rows(results, "corridor")
     colours = {name: f"C{number}" for number, name in enumerate(ours)}
-    drawn, axes = base.panels(11, 5.2, 2, sharey=True)
+    figure, axes = base.make_panels(11, 5.2, 2, sharey=True)
     for axis, title, rows in zip(axes, ("the author's matrices", "here"), (theirs, ours), strict=True):
-        for name, row in sorted(rows.items(), key=lambda each: -each[1]["auc_2_3"]):
+        for name, row in sorted(rows.items(), key=lambda item: -item[1]["auc_2_3"]):
             precision, recall = zip(*row["precision_recall"], strict=True)
             style = {"color": "k", "lw": 2} if name not in theirs and "cohog" in name else {"color": colours[name]}
             axis.plot(recall, precision, label=f"{name} {row['auc_2_3']:.2f}", **style)
         axis.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", title=f"corridor: {title}")
         axis.legend(title="AUC (2.3)", fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13))
     axes[0].set_ylabel("precision")
-    base.save(drawn, path)
+    base.save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -1,36 +1,24 @@
 """What techniques cost, by the thesis and here: charge, times, memory, PCU. Sections of docs/thesis.md."""
 
+import thesis_values as values
 from base import format_markdown_table
-from thesis_values import (
-    MATRICES,
-    ROWS,
-    THESIS,
-    Results,
-    corners,
-    half_digit,
-    measured_rows,
-    pcu_of,
-    printed_pcu,
-    sentence,
-    three,
-    total_ah,
-)
+from thesis_values import MATRICES, ROWS, THESIS, Results, capitalise, compute_table_pcu, format_3g, select_rows
 
 FLOAT_BYTES = 4
 
 
-def charge() -> str:
+def format_charge() -> str:
     """Table 5.2: the power model on the thesis's own inputs."""
     table = THESIS["table_5_2"]
     rows = []
     for name, (*inputs, printed_ah) in table["techniques"].items():
-        ours, least, most = corners(total_ah, inputs)
-        theirs, half = float(printed_ah), half_digit(printed_ah)
+        ours, least, most = values.bound_formula(values.total_ah, inputs)
+        theirs, half = float(printed_ah), values.half_digit(printed_ah)
         fits = least <= theirs + half and theirs - half <= most
         rows.append([name, printed_ah, f"{ours:.4f}", f"{ours / theirs - 1:+.2%}", "yes" if fits else "no"])
     return f"""## Table 5.2: ampere-hours of {table["queries"]} queries
 
-{sentence(table["source"])}. Here: `edgevpr.power.equations` with the profile `thesis-xeon` on the printed U_e, U_m,
+{capitalise(table["source"])}. Here: `edgevpr.power.equations` with the profile `thesis-xeon` on the printed U_e, U_m,
 t_e and t_m. The inputs are printed with two to four digits; the last column says whether numbers that are printed so
 give the printed Ah_t.
 
@@ -41,7 +29,7 @@ so it is here.
 """
 
 
-def times(results: Results) -> str:
+def format_times(results: Results) -> str:
     """t_e and t_m: tables 5.2 and 6.1, the text of 6.3.2, the author's times on corridor, and those here."""
     published = results.thesis["matrices"]
     power = THESIS["table_5_2"]
@@ -56,10 +44,11 @@ def times(results: Results) -> str:
             t_match_s = float(THESIS["cohog"]["t_match_per_ref_s"])
         later = published.get(MATRICES.get(name, ""), {})
         rows.append(
-            [name, f"{1e3 * t_encode_s:.0f}", three(later.get("t_encode_s"), 1e3), f"{1e3 * row['t_encode_s']:.1f}"]
+            [name, f"{1e3 * t_encode_s:.0f}", format_3g(later.get("t_encode_s"), 1e3), f"{1e3 * row['t_encode_s']:.1f}"]
         )
-        matched = [three(each, 1e6) for each in (t_match_s, later.get("t_match_per_ref_s"), row["t_match_per_ref_s"])]
-        rows[-1] += [three(t_encode_s / row["t_encode_s"]), *matched, three(t_match_s, 1 / row["t_match_per_ref_s"])]
+        here_s = row["t_match_per_ref_s"]
+        matched = [format_3g(time_s, 1e6) for time_s in (t_match_s, later.get("t_match_per_ref_s"), here_s)]
+        rows[-1] += [format_3g(t_encode_s / row["t_encode_s"]), *matched, format_3g(t_match_s, 1 / here_s)]
     heads = (
         "technique", "t_e thesis, ms", "author's, corridor", "here", "thesis / here",
         "t_m a reference, thesis, µs", "author's, corridor", "here", "thesis / here",
@@ -67,8 +56,8 @@ def times(results: Results) -> str:
     regions = THESIS["cohog"]["mean_regions"].values()
     many, numbers = THESIS["descriptors"]["CoHOG"]
     products = sum(regions) / len(regions) * many * numbers
-    (flown,) = (row for row in results.bench["two_stage"] if row["camera"] == "forward")
-    cpus = sorted({row["cpu"] for row in measured_rows(results, "corridor").values()})
+    (query,) = (row for row in results.bench["two_stage"] if row["camera"] == "forward")
+    cpus = sorted({row["cpu"] for row in select_rows(results, "corridor").values()})
     return f"""## Encoding and matching times
 
 t_e: table 6.1, page 103. t_m: table 5.2, page 87, over its {power["references"]} references; that of CoHOG in section
@@ -80,35 +69,35 @@ t_e: table 6.1, page 103. t_m: table 5.2, page 87, over its {power["references"]
 CoHOG's t_m of {1e6 * float(THESIS["cohog"]["t_match_per_ref_s"]):.0f} µs is the product of {min(regions)} to
 {max(regions)} good regions with {many} regions of {numbers} numbers, {products / 1e6:.0f} million multiplications: more
 than one core does in that time. *cohog* as it flies compares 12 places in full, and no more, whatever the map has:
-{flown["two_stage_ms"]:.0f} ms for a query of 10 000 places, encoding included.
+{query["two_stage_ms"]:.0f} ms for a query of 10 000 places, encoding included.
 """
 
 
-def pcu(results: Results) -> str:
+def format_pcu(results: Results) -> str:
     """Figure 6.6: PCU of table 6.1, of the author's matrices, and of the results here."""
     table = THESIS["table_6_1"]
-    here = pcu_of(measured_rows(results, "corridor"))
-    seasons = pcu_of(measured_rows(results, "grief_stromovka_seasons"))
-    published = pcu_of(results.thesis["matrices"])
+    here = values.compute_pcu(select_rows(results, "corridor"))
+    seasons = values.compute_pcu(select_rows(results, "grief_stromovka_seasons"))
+    published = values.compute_pcu(results.thesis["matrices"])
     rows = []
     for name in (*table["techniques"], "cohog, as it flies"):
-        printed = printed_pcu(name) if name in table["techniques"] else [None] * len(table["sets"])
+        printed = compute_table_pcu(name) if name in table["techniques"] else [None] * len(table["sets"])
         theirs = published.get(MATRICES.get(name, ""))
         ours = here.get(name)
         difference = None if theirs is None or ours is None else ours - theirs
-        rows.append(
-            [name, *map(_digits, (*printed, theirs, ours)), _digits(difference, "+.2f"), _digits(seasons.get(name))]
-        )
+        cells = map(_format_number, (*printed, theirs, ours))
+        rows.append([name, *cells, _format_number(difference, "+.2f"), _format_number(seasons.get(name))])
     heads = ("technique", *table["sets"], "corridor, author's", "corridor, here", "difference", "seasons, here")
     best = []
-    for at, on in enumerate(table["sets"]):
-        others = {name: printed_pcu(name)[at] or 0.0 for name in table["techniques"] if not name.startswith("CoHOG")}
+    names = [name for name in table["techniques"] if not name.startswith("CoHOG")]
+    for number, set_name in enumerate(table["sets"]):
+        others = {name: compute_table_pcu(name)[number] or 0.0 for name in names}
         first = max(others, key=lambda name: others[name])
-        best.append(f"{on} {printed_pcu('CoHOG')[at]:.2f} and {others[first]:.2f} ({first})")
+        best.append(f"{set_name} {compute_table_pcu('CoHOG')[number]:.2f} and {others[first]:.2f} ({first})")
     leader = max(published, key=lambda name: published[name])
     slowest_ms = [
         1e3 * max(row["t_encode_s"] for row in rows.values())
-        for rows in (results.thesis["matrices"], measured_rows(results, "corridor"))
+        for rows in (results.thesis["matrices"], select_rows(results, "corridor"))
     ]
     return f"""## Figure 6.6: PCU
 
@@ -129,7 +118,7 @@ not {1e3 * float(THESIS["cohog"]["t_encode_s"]):.0f}.
 """
 
 
-def memory(results: Results) -> str:
+def format_memory(results: Results) -> str:
     """Figures 4.7 and 5.7: the bytes of a reference, and of all of Shopping Street."""
     count = THESIS["table_5_2"]["references"]
     rows = []
@@ -155,18 +144,19 @@ map has fewer channels.
 """
 
 
-def map_ratio(results: Results) -> float:
+def compute_map_ratio(results: Results) -> float:
     """Return how many times smaller a reference of CoHOG is in RAM here."""
     many, numbers = THESIS["descriptors"]["CoHOG"]
     return many * numbers * FLOAT_BYTES / results.sets["corridor"]["techniques"]["cohog"]["descriptor_bytes"]
 
 
-def sets_where_cohog_leads() -> int:
+def count_sets_cohog_leads() -> int:
     """Count the sets of table 6.1 on which CoHOG has the best PCU of all techniques."""
     table = THESIS["table_6_1"]
-    others = [printed_pcu(name) for name in table["techniques"] if not name.startswith("CoHOG")]
-    return sum(own > max(each[at] or 0.0 for each in others) for at, own in enumerate(printed_pcu("CoHOG")))
+    others = [compute_table_pcu(name) for name in table["techniques"] if not name.startswith("CoHOG")]
+    cohog = compute_table_pcu("CoHOG")
+    return sum(pcu > max(pcus[number] or 0.0 for pcus in others) for number, pcu in enumerate(cohog))
 
 
-def _digits(value: float | None, form: str = ".2f") -> str:
+def _format_number(value: float | None, form: str = ".2f") -> str:
     return "-" if value is None else format(value, form)

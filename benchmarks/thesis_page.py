@@ -8,16 +8,16 @@ from base import format_markdown_table
 from thesis_values import ROWS, THESIS, Results, total_ah
 
 
-def answers(results: Results) -> list[list[str]]:
+def list_results(results: Results) -> list[list[str]]:
     """Return every table and figure with something to measure: what came out, and in which section it stands."""
     matrices, here = results.thesis["matrices"], results.sets["corridor"]["techniques"]
     power = THESIS["table_5_2"]["techniques"]
     worst = max(abs(total_ah(*map(float, inputs)) / float(ah) - 1) for *inputs, ah in power.values())
     calc = here[ROWS["CALC"]]["auc_2_3"] - matrices["CALC"]["auc_2_3"]
     cohog = here[ROWS["CoHOG"]]["recall_at_1"] - matrices["CoHOG"]["recall_at_1"]
-    leads = f"CoHOG first on {costs.sets_where_cohog_leads()} of {len(THESIS['table_6_1']['sets'])} sets, as it says"
+    leads = f"CoHOG first on {costs.count_sets_cohog_leads()} of {len(THESIS['table_6_1']['sets'])} sets, as it says"
     corridor = f"CALC's AUC {calc:+.3f}, CoHOG's recall@1 {cohog:+.3f}; networks less, being small ones"
-    smaller = f"CoHOG's map {costs.map_ratio(results):.0f} times smaller in RAM"
+    smaller = f"CoHOG's map {costs.compute_map_ratio(results):.0f} times smaller in RAM"
     return [
         ["table 5.2", "from its own inputs", f"Ah_t within {worst:.2%}", "ampere-hours"],
         ["figure 6.6", "from table 6.1; run on corridor", leads, "PCU"],
@@ -28,44 +28,44 @@ def answers(results: Results) -> list[list[str]]:
     ]
 
 
-def page(results: Results) -> str:
+def format_page(results: Results) -> str:
     """Return the whole page."""
-    made = results.thesis
-    machine = made["machine"]
-    missing = [[each["what"], each["why"]] for each in THESIS["not_reproduced"]]
+    origin = results.thesis
+    machine = origin["machine"]
+    missing = [[item["what"], item["why"]] for item in THESIS["not_reproduced"]]
     head = f"""# The thesis's tables and figures, and this project's
 
-Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. Made by `make thesis` ({made["date"]}, commit
-{made["commit"]}, {machine["cores"]} cores of an {machine["cpu"]}). The
+Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. Made by `make thesis` ({origin["date"]}, commit
+{origin["commit"]}, {machine["cores"]} cores of an {machine["cpu"]}). The
 thesis's values stand in [thesis.yaml](../benchmarks/thesis.yaml), each with its source. Values here come from
 [thesis.json](../benchmarks/results/thesis.json), from the results of `make results` and `make bench`, and from the
 thesis's own inputs.
 
-{format_markdown_table(("thesis", "how", "what came out", "section"), answers(results))}
+{format_markdown_table(("thesis", "how", "what came out", "section"), list_results(results))}
 """
     tail = f"""## What cannot be reproduced
 
 {format_markdown_table(("what", "why"), missing)}
 """
     sections = (
-        costs.charge(),
-        costs.times(results),
-        quality.corridor(results),
-        quality.precision(results),
-        costs.pcu(results),
-        quality.memorable(results),
-        costs.memory(results),
+        costs.format_charge(),
+        costs.format_times(results),
+        quality.format_corridor(results),
+        quality.format_precision(results),
+        costs.format_pcu(results),
+        quality.format_memorable_maps(results),
+        costs.format_memory(results),
         tail,
     )
-    return reflowed("\n".join((head, *sections)))
+    return wrap_paragraphs("\n".join((head, *sections)))
 
 
-def reflowed(page: str) -> str:
+def wrap_paragraphs(page: str) -> str:
     """Break the lines of every paragraph anew: numbers of any length stand in them. Tables, lists, headings and
     pictures stay as they are."""
-    blocks = page.rstrip().split("\n\n")
-    return "\n\n".join(each if each.lstrip()[0] in "#|*!" else _filled(each) for each in blocks) + "\n"
-
-
-def _filled(paragraph: str) -> str:
-    return textwrap.fill(" ".join(paragraph.split()), 120, break_long_words=False, break_on_hyphens=False)
+    wrapper = textwrap.TextWrapper(120, break_long_words=False, break_on_hyphens=False)
+    blocks = [
+        block if block.lstrip()[0] in "#|*!" else wrapper.fill(" ".join(block.split()))
+        for block in page.rstrip().split("\n\n")
+    ]
+    return "\n\n".join(blocks) + "\n"

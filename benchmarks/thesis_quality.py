@@ -1,7 +1,7 @@
 """How well techniques recognise, by the thesis and here, and memorable maps. Sections of docs/thesis.md."""
 
 from base import format_markdown_table
-from thesis_values import MATRICES, ROWS, THESIS, Results, measured_rows, sentence
+from thesis_values import MATRICES, ROWS, THESIS, Results, capitalise, select_rows
 
 # What is different here from the author's techniques.
 SMALL = "the small network that is shipped stands in for a large one trained for places or ImageNet"
@@ -20,35 +20,35 @@ FIGURES = {
 }
 
 
-def corridor(results: Results) -> str:
+def format_corridor(results: Results) -> str:
     """The author's matrices of corridor beside the same techniques here."""
-    found, shaped = [], []
-    for name, of in MATRICES.items():
-        theirs, ours = results.thesis["matrices"][of], results.sets["corridor"]["techniques"][ROWS[name]]
-        each = {
+    rows, curve_rows = [], []
+    for name, matrix in MATRICES.items():
+        theirs, ours = results.thesis["matrices"][matrix], results.sets["corridor"]["techniques"][ROWS[name]]
+        cells = {
             figure: [f"{theirs[key]:.3f}", f"{ours[key]:.3f}", f"{ours[key] - theirs[key]:+.3f}"]
             for figure, key in FIGURES.items()
         }
         between = "-".join(f"{end:.2f}" for end in theirs["recall_at_1_interval"] or ()) or "not known"
-        found.append([name, *each["recall@1"], between, *each["P@100%R"], REASONS.get(name, SMALL)])
-        shaped.append([name, *each["AUC"], *each["AUC (2.3)"], *each["EP"]])
+        rows.append([name, *cells["recall@1"], between, *cells["P@100%R"], REASONS.get(name, SMALL)])
+        curve_rows.append([name, *cells["AUC"], *cells["AUC (2.3)"], *cells["EP"]])
     three_of = {figure: [f"{figure} author's", "here", "difference"] for figure in FIGURES}
-    found_heads = ("technique", *three_of["recall@1"], "95 % of author's", *three_of["P@100%R"], "reason")
-    shaped_heads = ("technique", *three_of["AUC"], *three_of["AUC (2.3)"], *three_of["EP"])
-    flown = results.sets["corridor"]["techniques"]["cohog"]
-    reached = ", ".join(f"{figure} {flown[key]:.3f}" for figure, key in FIGURES.items())
+    heads = ("technique", *three_of["recall@1"], "95 % of author's", *three_of["P@100%R"], "reason")
+    curve_heads = ("technique", *three_of["AUC"], *three_of["AUC (2.3)"], *three_of["EP"])
+    cohog = results.sets["corridor"]["techniques"]["cohog"]
+    reached = ", ".join(f"{figure} {cohog[key]:.3f}" for figure, key in FIGURES.items())
     return f"""## Corridor: the author's similarity matrices
 
 The thesis's own sets are not at hand, but corridor is (table 2.1 has it), and the author published the similarity
 matrices of eight techniques on it with his later benchmark, VPR-Bench. Here the code of `edgevpr eval` computes the
 figures of both (`cohog` as in the thesis, with `matching=thesis` and `--exact`).
-One query is {1 / flown["queries"]:.3f}.
+One query is {1 / cohog["queries"]:.3f}.
 
-{format_markdown_table(found_heads, found)}
+{format_markdown_table(heads, rows)}
 
 AUC is from recall 0, as VPR-Bench and scikit-learn compute it; the thesis's own is by equation 2.3.
 
-{format_markdown_table(shaped_heads, shaped)}
+{format_markdown_table(curve_heads, curve_rows)}
 
 AMOSNet and HybridNet differ by their weights alone, and so not at all on the same small network. CALC is the only
 network of which the author's own weights are at hand, and comes out the same. `cohog` as it flies
@@ -58,19 +58,20 @@ network of which the author's own weights are at hand, and comes out the same. `
 """
 
 
-def precision(results: Results) -> str:
+def format_precision(results: Results) -> str:
     """Table 6.1, its precisions, beside those on the sets that are at hand."""
     table = THESIS["table_6_1"]
     sets = ("corridor", *OTHER_SETS)
-    here = {name: measured_rows(results, name) for name in sets}
+    here = {name: select_rows(results, name) for name in sets}
     rows = []
     for name in (*ROWS, "cohog, as it flies"):
-        printed = [float(each) for each in table["techniques"].get(name, ())[: len(table["sets"])] if each is not None]
+        values = table["techniques"].get(name, ())[: len(table["sets"])]
+        printed = [float(value) for value in values if value is not None]
         spread = f"{min(printed):.2f} to {max(printed):.2f}" if printed else "-"
-        rows.append([name, spread, *(f"{here[on][name]['precision_at_100_recall']:.2f}" for on in sets)])
+        rows.append([name, spread, *(f"{here[set_name][name]['precision_at_100_recall']:.2f}" for set_name in sets)])
     return f"""## Table 6.1 and figure 6.7: precision at 100 % recall
 
-{sentence(table["source"])}. Its five sets ({", ".join(table["sets"])}) are not at hand: the first column is the least
+{capitalise(table["source"])}. Its five sets ({", ".join(table["sets"])}) are not at hand: the first column is the least
 and the most that the thesis has on them, the others are other places, and no difference would say anything. What can be
 compared is the order of the techniques on the same set. Networks here are small ones in the place of large ones; in
 the sets from the air `cohog` as it flies looks down and turns, and the thesis's CoHOG does not.
@@ -79,7 +80,7 @@ the sets from the air `cohog` as it flies looks down and turns, and the thesis's
 """
 
 
-def memorable(results: Results) -> str:
+def format_memorable_maps(results: Results) -> str:
     """Figures 3.12, 3.20 and 3.21, from the benchmark of the gate."""
     gate, larger, wronger = [], 0, 0
     before = {(row["set"], row["technique"]): row for row in results.salience["gate"] if row["gate"] == "none"}

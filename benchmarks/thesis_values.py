@@ -40,7 +40,7 @@ MATRICES = {
     "Region-VLAD": "RegionVLAD",
     "CoHOG": "CoHOG",
 }
-XEON = "thesis-xeon"
+XEON_BOARD = "thesis-xeon"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,24 +60,24 @@ def read_results(folder: Path) -> Results:
     return Results(sets, *(base.read(name, folder) for name in ("bench", "salience", "thesis")))
 
 
-def corners(formula: Callable[..., float], printed: Iterable[str]) -> tuple[float, float, float]:
+def bound_formula(formula: Callable[..., float], printed: Iterable[str]) -> tuple[float, float, float]:
     """Return what a formula makes of printed numbers, and the least and the most it can make of the numbers that they
     were rounded from; the formula is monotonic in each."""
     texts = list(printed)
     ends = [(float(text) - half_digit(text), float(text) + half_digit(text)) for text in texts]
-    values = [formula(*each) for each in itertools.product(*ends)]
+    values = [formula(*corner) for corner in itertools.product(*ends)]
     return formula(*map(float, texts)), min(values), max(values)
 
 
-def three(value: float | None, by: float = 1.0) -> str:
-    """Write a number, times `by`, with three digits that count, and never with an exponent."""
+def format_3g(value: float | None, factor: float = 1.0) -> str:
+    """Format a number, times `factor`, with three significant digits and without an exponent."""
     if value is None:
         return "-"
-    rounded = float(f"{value * by:.3g}")
+    rounded = float(f"{value * factor:.3g}")
     return f"{rounded:,.0f}" if rounded >= 1000 else f"{rounded:g}"
 
 
-def sentence(text: str) -> str:
+def capitalise(text: str) -> str:
     """Begin a text with a capital."""
     return text[:1].upper() + text[1:]
 
@@ -89,21 +89,21 @@ def half_digit(text: str) -> float:
 
 def total_ah(u_encode: float, u_match: float, t_encode_s: float, t_match_s: float) -> float:
     """Compute Ah_t (5.7) by the power model of this project on the thesis's server, for N queries."""
-    table, board = THESIS["table_5_2"], load_board(XEON)
+    table, board = THESIS["table_5_2"], load_board(XEON_BOARD)
     energy_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
     energy_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
     return queries_ah(table["queries"], energy_j / (3600 * table["rail_v"]))
 
 
-def printed_pcu(technique: str) -> list[float | None]:
+def compute_table_pcu(technique: str) -> list[float | None]:
     """Return the PCU of a technique of table 6.1 on each of its sets: the bars of figure 6.6."""
     table = THESIS["table_6_1"]
     *precisions, t_encode_s, _ = table["techniques"][technique]
     slowest_s = float(table["slowest_s"])
-    return [None if each is None else metrics.pcu(float(each), float(t_encode_s), slowest_s) for each in precisions]
+    return [None if value is None else metrics.pcu(float(value), float(t_encode_s), slowest_s) for value in precisions]
 
 
-def pcu_of(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
+def compute_pcu(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
     """Return the PCU of rows with `precision_at_100_recall` and `t_encode_s`, against the slowest of them."""
     slowest_s = max(row["t_encode_s"] for row in rows.values())
     return {
@@ -111,8 +111,8 @@ def pcu_of(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
     }
 
 
-def measured_rows(results: Results, name: str) -> dict[str, dict[str, Any]]:
+def select_rows(results: Results, name: str) -> dict[str, dict[str, Any]]:
     """Return the rows of a set by the thesis's names of the techniques, and `cohog` as it flies."""
     techniques = results.sets[name]["techniques"]
-    found = {of: techniques[label] for of, label in ROWS.items() if label in techniques}
-    return {**found, "cohog, as it flies": techniques["cohog"]}
+    rows = {thesis_name: techniques[label] for thesis_name, label in ROWS.items() if label in techniques}
+    return {**rows, "cohog, as it flies": techniques["cohog"]}

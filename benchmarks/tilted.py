@@ -28,7 +28,7 @@ ARIEL_TILT_DEG = 45.0
 ARIEL_FOV_DEG = 70.0
 FOV_DEG = 28.0
 TILTS_DEG = (0.0, 20.0, 45.0, 60.0)
-_TOLD = {"tilt": {}, "nothing": {"roll_deg": None, "pitch_deg": None}, "level": {"roll_deg": 0.0, "pitch_deg": 0.0}}
+_ANGLES = {"tilt": {}, "nothing": {"roll_deg": None, "pitch_deg": None}, "level": {"roll_deg": 0.0, "pitch_deg": 0.0}}
 _COLUMNS = {
     "tilt": "{tilt:.0f}",
     "told": "{told}",
@@ -40,15 +40,16 @@ _COLUMNS = {
 }
 
 
-def measure(folder: Path, work: Path) -> list[Row]:
+def measure_tilts(folder: Path, work: Path) -> list[Row]:
     path, rows = work / "before.gpkg", []
     size = ("--footprint-m", f"{from_space.FOOTPRINT_M:.1f}", "--spacing-m", f"{from_space.SPACING_M:g}")
-    base.edgevpr("map", "build", path, "--orthophoto", folder / "raster" / "before.vrt", *size)
+    base.run_edgevpr("map", "build", path, "--orthophoto", folder / "raster" / "before.vrt", *size)
     for tilt_deg in TILTS_DEG:
-        frames = list(from_space.flown(folder / "raster" / "after.vrt", FOV_DEG, tilt_deg))[::2]
-        for told, angles in _TOLD.items():
-            found = from_space.matched(path, (replace(each, **angles) for each in frames), "heading, height", FOV_DEG)
-            rows.append({"tilt": tilt_deg, "told": told, **found})
+        frames = list(from_space.render_flight(folder / "raster" / "after.vrt", FOV_DEG, tilt_deg))[::2]
+        for known, angles in _ANGLES.items():
+            changed = (replace(frame, **angles) for frame in frames)
+            row = from_space.match_frames(path, changed, "heading, height", FOV_DEG)
+            rows.append({"tilt": tilt_deg, "told": known, **row})
             print(rows[-1], flush=True)
     return rows
 
@@ -57,30 +58,31 @@ def measure_ariel(folder: Path, work: Path) -> list[Row]:
     """Map and match the stills of tilt_ariel as a user does."""
     lens = ("--fov-deg", f"{ARIEL_FOV_DEG:g}")
     path, tilted = work / "ariel.gpkg", work / "positions.csv"
-    tags = read_positions(folder / "positions.csv")
+    positions = folder / "positions.csv"
+    tags = read_positions(positions)
     angles = {"roll_deg": 0.0, "pitch_deg": ARIEL_TILT_DEG}
     write_positions(tilted, {name: replace(tag, height_m=tag.position.alt_m, **angles) for name, tag in tags.items()})
     images = ("--images", folder / "ref", "--positions", tilted)
-    base.edgevpr("map", "build", path, *images, "--camera", "nadir", *lens)
-    found = []
-    known = {"tilt": (tilted, *lens), "lens": (folder / "positions.csv", *lens), "nothing": (folder / "positions.csv",)}
-    for told, options in known.items():
-        matches = base.edgevpr("match", path, "--images", folder / "query", "--positions", *options)
+    base.run_edgevpr("map", "build", path, *images, "--camera", "nadir", *lens)
+    rows = []
+    options_by_known = {"tilt": (tilted, *lens), "lens": (positions, *lens), "nothing": (positions,)}
+    for known, options in options_by_known.items():
+        matches = base.run_edgevpr("match", path, "--images", folder / "query", "--positions", *options)
         accepted = [match for match in matches if match["accepted"]]
         claims = [(match["from_gps_tag_m"], match["position"]["accuracy_m"]) for match in accepted]
         counts = {"queries": len(matches), "accepted": len(claims)}
-        found.append({"tilt": ARIEL_TILT_DEG, "told": told, **counts, **from_space.judge_claims(claims)})
-    return found
+        rows.append({"tilt": ARIEL_TILT_DEG, "told": known, **counts, **from_space.judge_claims(claims)})
+    return rows
 
 
 def main() -> None:
-    folder, ariel = base.find_sets(names=[from_space.SET, ARIEL])
+    folder, ariel = base.find_sets(names=[from_space.SET_NAME, ARIEL])
     with tempfile.TemporaryDirectory(prefix="edgevpr-tilted-") as work:
-        rows = {"rows": measure(folder, Path(work)), "ariel": measure_ariel(ariel, Path(work))}
-    found = {**base.made_by(), **rows}
-    parts = ["# Tilted views", base.told(__doc__), base.table(found["rows"], _COLUMNS), f"## {ARIEL}"]
-    parts.append(base.table(found["ariel"], _COLUMNS))
-    base.write("tilted", found, "\n\n".join([*parts, base.made_line(found, "make tilted")]))
+        rows = {"rows": measure_tilts(folder, Path(work)), "ariel": measure_ariel(ariel, Path(work))}
+    result = {**base.describe_run(), **rows}
+    parts = ["# Tilted views", base.strip_title(__doc__), base.format_table(result["rows"], _COLUMNS), f"## {ARIEL}"]
+    parts.append(base.format_table(result["ariel"], _COLUMNS))
+    base.write("tilted", result, "\n\n".join([*parts, base.format_origin(result, "make tilted")]))
 
 
 if __name__ == "__main__":

@@ -31,56 +31,55 @@ from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
 
 
-def dataset_of(folder: Path) -> Dataset:
+def load_matched_set(folder: Path) -> Dataset:
     """Read a set; of its queries those whose place is in the map: how foreign ones fare has benchmarks of its own."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
     return replace(dataset, queries=tuple(query for query in dataset.queries if query.correct))
 
 
-def config(**keys: object) -> Config:
+def make_config(**keys: object) -> Config:
     """Return the configuration with these keys, `map` for example, and otherwise as nobody has changed it."""
     return load_config(None, keys)
 
 
-def meter() -> QueryMeter:
+def make_meter() -> QueryMeter:
     return QueryMeter(load_board("this"))
 
 
-def frames_of(folder: Path) -> Iterator[Frame]:
+def read_folder_frames(folder: Path) -> Iterator[Frame]:
     """Yield the pictures of a folder, with their positions."""
     return read_frames(open_source(str(folder), live=False))
 
 
-def frame(image: np.ndarray | Path, name: str | None = None, t_s: float = 0.0) -> Frame:
+def make_frame(image: np.ndarray | Path, name: str | None = None, t_s: float = 0.0) -> Frame:
     """Make a frame of a picture, or of the picture in a file."""
     if isinstance(image, Path):
         return Frame(image=read_image(image), name=name or image.name, t_mono_s=t_s)
     return Frame(image=image, name=name or "", t_mono_s=t_s)
 
 
-def cohog(camera: str) -> Technique:
+def make_cohog(camera: str) -> Technique:
     return create("cohog", {"camera": camera})
 
 
 @contextmanager
-def map_of(
+def make_map(
     folder: Path, technique: Technique | None = None, images: Path | None = None
 ) -> Iterator[tuple[PlaceMap, PlaceIndex, Technique]]:
     """Map the references of a set, by `cohog` unless another technique is named. The map is refined and calibrated as
     `map build` does where `images` names their folder, from which pictures are read again."""
-    technique = technique or cohog(base.camera_of(folder.name))
-    with open_temporary_map(frames_of(folder / "ref"), technique, images) as (place_map, index, _):
+    technique = technique or make_cohog(base.infer_camera(folder.name))
+    with open_temporary_map(read_folder_frames(folder / "ref"), technique, images) as (place_map, index, _):
         yield place_map, index, technique
 
 
-def walk(
+def make_walk(
     place_map: PlaceMap,
     index: PlaceIndex,
     technique: Technique,
     *,
     rule: AcceptRule | None = None,
     search: SequenceSearch | None = None,
-    verify: bool = True,
     min_accuracy_m: float = 1.0,
     all_evidence: bool = False,
     levelling: Levelling | None = None,
@@ -88,15 +87,15 @@ def walk(
 ) -> Recogniser:
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
     given; `more` is anything else of a `Recogniser`."""
-    rule = rule or make_accept_rule(technique, config().match, 1, read_calibration_for(place_map))
+    rule = rule or make_accept_rule(technique, make_config().match, 1, read_calibration_for(place_map))
     settings = MatchSettings(
-        candidates=technique.candidates, verify=verify, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
+        candidates=technique.candidates, verify=True, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
     )
     encoder = FrameEncoder(technique=technique, levelling=levelling)
-    return Recogniser(encoder, place_map, Matcher(index, rule, search), meter(), settings=settings, **more)
+    return Recogniser(encoder, place_map, Matcher(index, rule, search), make_meter(), settings=settings, **more)
 
 
-def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
+def list_ranked_names(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
     """Return the names of the places that a query found, best first, by the names of the slots. Raises EdgevprError
     where it failed."""
     if event.failed:
@@ -104,15 +103,15 @@ def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
     return [names[slot] for slot in event.ranking.slots] if event.ranking else []
 
 
-def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
+def read_names(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
     """Return the names of the pictures of the places, by slot."""
     names = {place.place_id: place.source_image for place in place_map.read_places()}
     return [names[place_id] for place_id in index.place_ids.tolist()]
 
 
 @contextmanager
-def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
+def open_walk(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
     """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
     technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
-    with open_temporary_map(map(frame, places), technique) as (place_map, index, _):
-        yield walk(place_map, index, technique, rule=AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0))
+    with open_temporary_map(map(make_frame, places), technique) as (place_map, index, _):
+        yield make_walk(place_map, index, technique, rule=AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0))

@@ -30,10 +30,11 @@ from edgevpr.places.mapfile import PlaceMap
 
 SETS = ("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "aerial_brighton")
 _PAIR_SD = (0.01, 0.05)  # of a registered pair: of the step, as a share of the longest side, and of the log
-_NEAREST = 4
-NADIR = ("--technique", "cohog", "--camera", "nadir")
-HOWS = {"before": ("--no-refine",), "after": ()}
-SEEDS, NOISE_M = (11, 12, 13), 5.0
+_NEAREST_PICTURES = 4
+NADIR_FLAGS = ("--technique", "cohog", "--camera", "nadir")
+REFINE_FLAGS = {"before": ("--no-refine",), "after": ()}
+SEEDS = (11, 12, 13)
+NOISE_SD_M = 5.0  # of the positions of the map, in one axis
 _COLUMNS = {
     "set": "{set}",
     "use": "{use}",
@@ -47,7 +48,7 @@ _COLUMNS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Set:
+class AerialSet:
     """A set in metres, complex (east + i north) from its first tag: `tags` and, of those in its registered pairs,
     `truth` by name."""
 
@@ -57,98 +58,98 @@ class Set:
     tags: dict[str, complex]
     truth: dict[str, complex]
 
-    def to_metres(self, lat_deg: float, lon_deg: float) -> complex:
+    def to_metres(self, position: Position) -> complex:
         """Return a position in metres."""
-        return complex(*offset_m(*self.origin, lat_deg, lon_deg))
+        return complex(*offset_m(*self.origin, position.lat_deg, position.lon_deg))
 
 
-def load(folder: Path) -> Set:
+def load_set(folder: Path) -> AerialSet:
     """Read a set, and solve its truth."""
-    found = {name: tag.position for name, tag in read_positions(folder / "positions.csv").items() if tag.position}
-    first = next(iter(found.values()))
-    empty = Set(folder.name, folder, (first.lat_deg, first.lon_deg), {}, {})
-    tags = {name: empty.to_metres(each.lat_deg, each.lon_deg) for name, each in found.items()}
+    positions = {name: tag.position for name, tag in read_positions(folder / "positions.csv").items() if tag.position}
+    first = next(iter(positions.values()))
+    empty = AerialSet(folder.name, folder, (first.lat_deg, first.lon_deg), {}, {})
+    tags = {name: empty.to_metres(position) for name, position in positions.items()}
     names = sorted(tags)
-    solved = _registered(folder, names, tags)
+    solved = _solve_pairs(folder, names, tags)
     largest = np.bincount(solved.component).argmax()
-    truth = {name: complex(solved.position[at]) for at, name in enumerate(names) if solved.component[at] == largest}
-    return Set(folder.name, folder, empty.origin, tags, truth)
+    truth = {names[slot]: complex(solved.position[slot]) for slot in np.flatnonzero(solved.component == largest)}
+    return AerialSet(folder.name, folder, empty.origin, tags, truth)
 
 
-def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> GraphSolution:
-    number = {name: at for at, name in enumerate(names)}
+def _solve_pairs(folder: Path, names: list[str], tags: dict[str, complex]) -> GraphSolution:
+    slots = {name: slot for slot, name in enumerate(names)}
     rejected_path = folder / "rejected_pairs.csv"
     refused = base.read_csv(rejected_path) if rejected_path.is_file() else []
     rejected, pairs = {(row["file_a"], row["file_b"]) for row in refused}, base.read_csv(folder / "pairs_overlap.csv")
     rows = [row for row in pairs if (row["file_a"], row["file_b"]) not in rejected]
-    longest = {name: max(picture(folder, name).shape[:2]) for name in names}
+    longest = {name: max(read_set_image(folder, name).shape[:2]) for name in names}
     step = [complex(float(row["dx_px"]), -float(row["dy_px"])) / longest[row["file_b"]] for row in rows]
     turn = [complex(np.log(float(row["scale"])), -np.radians(float(row["rotation_deg"]))) for row in rows]
-    step_sd, turn_sd = (np.full(len(rows), each) for each in _PAIR_SD)
-    query, place = (np.array([number[row[key]] for row in rows]) for key in ("file_a", "file_b"))
+    step_sd, turn_sd = (np.full(len(rows), sd) for sd in _PAIR_SD)
+    query, place = (np.array([slots[row[key]] for row in rows]) for key in ("file_a", "file_b"))
     ties = Ties(query=query, place=place, step=np.array(step), turn=np.array(turn), step_sd=step_sd, turn_sd=turn_sd)
     return solve_graph(np.array([tags[name] for name in names]), ties)
 
 
-def picture(folder: Path, name: str) -> np.ndarray:
+def read_set_image(folder: Path, name: str) -> np.ndarray:
     """Read a picture of a set, of the map or a query."""
     return read_image(next(folder / part / name for part in ("ref", "query") if (folder / part / name).is_file()))
 
 
-def measure(folder: Path, work: Path) -> tuple[Row, dict[str, Place], Set]:
+def measure_set(folder: Path, work: Path) -> tuple[Row, dict[str, Place], AerialSet]:
     """Map and match a set, as it is and refined."""
-    of, matches = load(folder), {}
-    for how, flags in HOWS.items():
+    site, matches = load_set(folder), {}
+    for how, flags in REFINE_FLAGS.items():
         path = work / f"{folder.name}_{how}.gpkg"
-        built = base.edgevpr("map", "build", path, "--images", folder / "ref", *NADIR, *flags)
-        matches[how] = base.edgevpr("match", path, "--images", folder / "query")
+        built = base.run_edgevpr("map", "build", path, "--images", folder / "ref", *NADIR_FLAGS, *flags)
+        matches[how] = base.run_edgevpr("match", path, "--images", folder / "query")
     with PlaceMap.open(path) as place_map:
         places = {place.source_image: place for place in place_map.read_places()}
-    errors, variances = _errors(of, matches, places)
+    errors, variances = _compute_errors(site, matches, places)
     tag_var = (built["refined"]["recorded_sd_m"] or 0.0) ** 2
     row = {
         "set": folder.name,
-        "use": base.use_of(folder.name),
-        "spacing_m": float(np.median(abs(np.diff([of.tags[name] for name in places])))),
-        "errors": {truth: {how: spread(values) for how, values in by.items()} for truth, by in errors.items()},
+        "use": base.find_use(folder.name),
+        "spacing_m": float(np.median(abs(np.diff([site.tags[name] for name in places])))),
+        "errors": {truth: {how: summarise(own) for how, own in by_how.items()} for truth, by_how in errors.items()},
         "within": {
-            truth: honest(errors[truth]["after"], each, tag_var if truth == "GPS" else 0.0)
-            for truth, each in variances.items()
+            truth: compute_sigma_shares(errors[truth]["after"], own_variances, tag_var if truth == "GPS" else 0.0)
+            for truth, own_variances in variances.items()
         },
     }
-    return row, places, of
+    return row, places, site
 
 
-def _errors(of: Set, matches: dict[str, list[Row]], places: dict[str, Place]) -> tuple[dict, dict]:
+def _compute_errors(site: AerialSet, matches: dict[str, list[Row]], places: dict[str, Place]) -> tuple[dict, dict]:
     """Return the errors of fixes by their truth, before and after refining, and the variances of those after it, east
     and north."""
-    here = {name: of.to_metres(place.position.lat_deg, place.position.lon_deg) for name, place in places.items()}
-    lie = [name for name, place in places.items() if place.pose]
+    places_m = {name: site.to_metres(place.position) for name, place in places.items()}
+    refined = [name for name, place in places.items() if place.pose and name in site.truth]
     errors: dict[str, dict[str, list[complex]]] = {}
     variances: dict[str, list[tuple[float, float]]] = {}
-    for how, each in ((how, each) for how, found in matches.items() for each in found):
-        name, fix = each["query"], each["position"]
-        if fix is None or (how == "after" and places[each["place"]["image"]].pose is None):
+    for how, match in ((how, match) for how, how_matches in matches.items() for match in how_matches):
+        name, fix = match["query"], match["position"]
+        if fix is None or (how == "after" and places[match["place"]["image"]].pose is None):
             continue
-        truths = {"GPS": of.tags.get(name)}
-        near = sorted(
-            (ref for ref in lie if ref in of.truth), key=lambda ref: abs(of.truth[ref] - of.truth.get(name, 0))
-        )
-        if name in of.truth and len(near) >= _NEAREST:
-            truths["pairs"] = of.truth[name] + np.mean([here[ref] - of.truth[ref] for ref in near[:_NEAREST]])
-        for truth, at in truths.items():
-            here_m = of.to_metres(fix["lat_deg"], fix["lon_deg"])
-            errors.setdefault(truth, {}).setdefault(how, []).append(here_m - at)
+        truths = {"GPS": site.tags.get(name)}
+        near = sorted(refined, key=lambda ref: abs(site.truth[ref] - site.truth.get(name, 0)))
+        if name in site.truth and len(near) >= _NEAREST_PICTURES:
+            truths["pairs"] = site.truth[name] + np.mean(
+                [places_m[ref] - site.truth[ref] for ref in near[:_NEAREST_PICTURES]]
+            )
+        for truth, true_m in truths.items():
+            here_m = site.to_metres(Position(fix["lat_deg"], fix["lon_deg"]))
+            errors.setdefault(truth, {}).setdefault(how, []).append(here_m - true_m)
             if how == "after":
                 var_east_m2, _, var_north_m2 = fix["covariance_m2"]
                 variances.setdefault(truth, []).append((var_east_m2, var_north_m2))
     return errors, variances
 
 
-def generated(work: Path, what: str, lens: tuple[str, ...]) -> Row:
+def measure_generated_flights(work: Path, what: str, lens: tuple[str, ...]) -> Row:
     """Map and match generated flights of several seeds, with noise on the positions of the map; with a `lens`, attitude
     and height are used."""
-    errors: dict[str, list[complex]] = {how: [] for how in HOWS}
+    errors: dict[str, list[complex]] = {how: [] for how in REFINE_FLAGS}
     variances = []
     for seed in SEEDS:
         folder = work / f"seed{seed}{len(lens)}"
@@ -156,108 +157,109 @@ def generated(work: Path, what: str, lens: tuple[str, ...]) -> Row:
             write_generated_flight(folder / which, which, seed)
         _add_noise(folder / "map" / "positions.csv", seed)
         true = {name: tag.position for name, tag in read_positions(folder / "query" / "positions.csv").items()}
-        for how, flags in HOWS.items():
-            path, (images, asked) = folder / f"{how}.gpkg", (folder / which / "images" for which in ("map", "query"))
-            base.edgevpr("map", "build", path, "--images", images, *NADIR, *lens, *flags)
-            for match in base.edgevpr("match", path, "--images", asked, *lens):
+        for how, flags in REFINE_FLAGS.items():
+            path, (images, queries) = folder / f"{how}.gpkg", (folder / which / "images" for which in ("map", "query"))
+            base.run_edgevpr("map", "build", path, "--images", images, *NADIR_FLAGS, *lens, *flags)
+            for match in base.run_edgevpr("match", path, "--images", queries, *lens):
                 if match["accepted"]:
-                    here, where = true[match["query"]], match["position"]
-                    off_m = offset_m(here.lat_deg, here.lon_deg, where["lat_deg"], where["lon_deg"])
+                    truth, fix = true[match["query"]], match["position"]
+                    off_m = offset_m(truth.lat_deg, truth.lon_deg, fix["lat_deg"], fix["lon_deg"])
                     errors[how].append(complex(*off_m))
                     if how == "after":
-                        variances.append((where["covariance_m2"][0], where["covariance_m2"][2]))
+                        variances.append((fix["covariance_m2"][0], fix["covariance_m2"][2]))
     return {
         "set": f"{len(SEEDS)} generated flights, {what}",
         "use": "report",
         "spacing_m": 21.0,
-        "errors": {"true": {how: spread(values) for how, values in errors.items()}},
-        "within": {"true": honest(errors["after"], variances, 0.0)},
+        "errors": {"true": {how: summarise(values) for how, values in errors.items()}},
+        "within": {"true": compute_sigma_shares(errors["after"], variances, 0.0)},
     }
 
 
 def _add_noise(path: Path, seed: int) -> None:
     tags, rng = read_positions(path), np.random.default_rng(seed)
     for name, tag in tags.items():
-        at = offset_position(tag.position.lat_deg, tag.position.lon_deg, *rng.normal(0, NOISE_M, 2).tolist())
-        tags[name] = replace(tag, position=Position(*at, tag.position.alt_m))
+        position = offset_position(tag.position.lat_deg, tag.position.lon_deg, *rng.normal(0, NOISE_SD_M, 2).tolist())
+        tags[name] = replace(tag, position=Position(*position, tag.position.alt_m))
     write_positions(path, tags)
 
 
-def spread(errors: list[complex]) -> dict:
+def summarise(errors: list[complex]) -> dict:
     """Return count, median and 95th percentile of errors."""
-    away = np.abs(errors)
+    errors_m = np.abs(errors)
     return {
-        "count": len(away),
-        "median_m": round(float(np.median(away)), 2),
-        "p95_m": round(float(np.percentile(away, 95)), 2),
+        "count": len(errors_m),
+        "median_m": round(float(np.median(errors_m)), 2),
+        "p95_m": round(float(np.percentile(errors_m, 95)), 2),
     }
 
 
-def honest(errors: list[complex], variances: list[tuple[float, float]], more_m2: float) -> dict:
+def compute_sigma_shares(errors: list[complex], variances: list[tuple[float, float]], more_m2: float) -> dict:
     """Return which shares of errors, axis by axis, are within one and two standard deviations; `more_m2` is the
     variance of the truth."""
-    off = np.array([(each.real, each.imag) for each in errors])
+    off = np.array([(error.real, error.imag) for error in errors])
     ratio = abs(off) / np.sqrt(np.array(variances) + more_m2)
     return {"one_sigma": round(float((ratio < 1).mean()), 3), "two_sigma": round(float((ratio < 2).mean()), 3)}
 
 
 def main() -> None:
-    found, shown = {**base.made_by(), "sets": []}, []
+    result, maps = {**base.describe_run(), "sets": []}, []
     with tempfile.TemporaryDirectory(prefix="edgevpr-where-") as work:
         for folder in base.find_sets(names=SETS):
-            row, places, of = measure(folder, Path(work))
-            found["sets"].append(row)
-            shown.append((of, places))
-        found["sets"].append(generated(Path(work), "attitude unknown", ()))
-        found["sets"].append(generated(Path(work), "attitude known", ("--fov-deg", "66")))
-    base.write("where", found, page(found))
-    draw(shown, RESULTS / "where_maps.png")
+            row, places, site = measure_set(folder, Path(work))
+            result["sets"].append(row)
+            maps.append((site, places))
+        result["sets"].append(measure_generated_flights(Path(work), "attitude unknown", ()))
+        result["sets"].append(measure_generated_flights(Path(work), "attitude known", ("--fov-deg", "66")))
+    base.write("where", result, format_page(result))
+    draw_maps(maps, RESULTS / "where_maps.png")
 
 
-def page(found: Row) -> str:
+def format_page(result: Row) -> str:
     """Return the results as Markdown."""
     rows = [
-        {**row, "truth": truth, **by, "within": row["within"].get(truth)}
-        for row in found["sets"]
-        for truth, by in sorted(row["errors"].items())
+        {**row, "truth": truth, **by_how, "within": row["within"].get(truth)}
+        for row in result["sets"]
+        for truth, by_how in sorted(row["errors"].items())
     ]
     return f"""# Where exactly
 
-{base.told(__doc__, "Writes where.json")}
+{base.strip_title(__doc__, "Writes where.json")}
 
 Errors are median / 95th percentile of accepted matches: before refining, of the place's own position; after it, of the
 fix. Within: shares of errors, axis by axis, within one and two standard deviations of the fix (asked 0.68, 0.95);
 against GPS with the scatter of the tags, which refining has estimated, added.
 
-{base.table(rows, _COLUMNS)}
+{base.format_table(rows, _COLUMNS)}
 
-{base.made_line(found, "python benchmarks/where.py")} Constants were chosen on the sets marked *tune*.
+{base.format_origin(result, "python benchmarks/where.py")} Constants were chosen on the sets marked *tune*.
 
 ![maps](where_maps.png)
 """
 
 
-def draw(shown: list[tuple[Set, dict[str, Place]]], path: Path) -> None:
+def draw_maps(maps: list[tuple[AerialSet, dict[str, Place]]], path: Path) -> None:
     """Draw each map as it was recorded and refined, with the truth of its pairs."""
-    drawn, axes = base.panels(14, 14, len(shown), 2)
-    for axis, (of, places) in zip(axes, shown, strict=True):
-        lie = [name for name, place in places.items() if place.pose]
-        here = {name: of.to_metres(each.position.lat_deg, each.position.lon_deg) for name, each in places.items()}
-        both = [name for name in lie if name in of.truth]
-        offset = np.mean([here[name] - of.truth[name] for name in both])
-        for name, at in here.items():
-            was = of.tags[name]
-            axis.plot([was.real, at.real], [was.imag, at.imag], color="0.75", lw=0.8, zorder=1)
+    figure, axes = base.make_panels(14, 14, len(maps), 2)
+    for axis, (site, places) in zip(axes, maps, strict=True):
+        refined = [name for name, place in places.items() if place.pose]
+        places_m = {name: site.to_metres(place.position) for name, place in places.items()}
+        both = [name for name in refined if name in site.truth]
+        offset = np.mean([places_m[name] - site.truth[name] for name in both])
+        for name, place_m in places_m.items():
+            tag_m = site.tags[name]
+            axis.plot([tag_m.real, place_m.real], [tag_m.imag, place_m.imag], color="0.75", lw=0.8, zorder=1)
         for points, mark, colour, label in (
-            ([of.tags[name] for name in places], "o", "#c05030", "as recorded"),
-            ([here[name] for name in lie], "o", "#2060c0", "refined"),
-            ([of.truth[name] + offset for name in both], "+", "black", "registered pairs"),
+            ([site.tags[name] for name in places], "o", "#c05030", "as recorded"),
+            ([places_m[name] for name in refined], "o", "#2060c0", "refined"),
+            ([site.truth[name] + offset for name in both], "+", "black", "registered pairs"),
         ):
             axis.plot(np.real(points), np.imag(points), mark, color=colour, ms=5 if mark == "o" else 9, label=label)
-        axis.set(title=f"{of.name}: {len(lie)} of {len(places)} places refined", xlabel="east, m", ylabel="north, m")
+        title = f"{site.name}: {len(refined)} of {len(places)} places refined"
+        axis.set(title=title, xlabel="east, m", ylabel="north, m")
         axis.axis("equal")
         axis.legend()
-    base.save(drawn, path, 60)
+    base.save_figure(figure, path, 60)
 
 
 if __name__ == "__main__":

@@ -6,17 +6,20 @@ from typing import Any
 
 from edgevpr.techniques import create
 
-SMALL, LARGE = 1_000, 10_000  # places of the two maps whose scans were counted
+# The two maps whose scans were counted.
+SMALL_MAP_PLACES = 1_000
+LARGE_MAP_PLACES = 10_000
 _CAMERAS = {"forward": "ahead", "nadir": "down"}
 
 
-def figures(parts: Mapping[str, float]) -> dict[str, Any]:
+def compute_counts(parts: Mapping[str, float]) -> dict[str, Any]:
     """Return the content of the file."""
     content: dict[str, Any] = {}
     for camera, name in _CAMERAS.items():
         encode = parts[f"{name}: encode a frame"]
-        small, large = (parts[f"{name}: encode, and scan {places} places"] - encode for places in (SMALL, LARGE))
-        scan_per_place = (large - small) / (LARGE - SMALL)
+        small = parts[f"{name}: encode, and scan {SMALL_MAP_PLACES} places"] - encode
+        large = parts[f"{name}: encode, and scan {LARGE_MAP_PLACES} places"] - encode
+        scan_per_place = (large - small) / (LARGE_MAP_PLACES - SMALL_MAP_PLACES)
         technique = create("cohog", {"camera": camera})
         full = technique.spec.max_matches * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
         landmarks = 0.0
@@ -27,7 +30,7 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
             "match_per_place": (parts[f"{name}: a query"] - encode - large - full) / technique.candidates,
             "compare_once": full + landmarks,
             "scan_per_place": scan_per_place,
-            "scan_once": small - SMALL * scan_per_place,
+            "scan_once": small - SMALL_MAP_PLACES * scan_per_place,
         }
         content[camera] = {stage: round(count) for stage, count in work.items()}
     return content

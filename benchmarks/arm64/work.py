@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from counted import SMALL
+from counted import SMALL_MAP_PLACES
 
 from edgevpr.core.arrays import Image
 from edgevpr.frames.level import View
@@ -22,75 +22,72 @@ from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmark
 from edgevpr.runtime.recognise.odometry import VisualOdometry
 from edgevpr.techniques import create
 
-PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
+ARRAYS_BY_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
 
 
-def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
+def list_parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the name of each part, and a function that does it."""
-    yield from of_camera("ahead", "forward", ahead)
-    yield from of_camera("down", "nadir", down)
-    yield from of_landmarks(_picture(np.random.default_rng(0)))
+    yield from list_query_parts("ahead", "forward", ahead)
+    yield from list_query_parts("down", "nadir", down)
+    yield from list_landmark_parts(_make_picture(np.random.default_rng(0)))
 
 
-def _picture(rng: np.random.Generator) -> Image:
+def _make_picture(rng: np.random.Generator) -> Image:
     """Return noise, smoothed and stretched: nearly all regions are good, as over a town."""
     noise = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
     return cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
 
 
-def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable[[], object]]]:
+def list_query_parts(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield the parts of a query of `cohog` in one map."""
     rng = np.random.default_rng(0)
-    picture = _picture(rng)
+    picture = _make_picture(rng)
     technique = create("cohog", {"camera": camera})
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 100_000_000)
-        small = replace(index, **{each: getattr(index, each)[:SMALL] for each in PER_PLACE})
-        known = Expectation(rotation_deg=rng.choice([0.0, 180.0], len(index)))
+        small = replace(index, **{name: getattr(index, name)[:SMALL_MAP_PLACES] for name in ARRAYS_BY_PLACE})
+        heading_known = Expectation(rotation_deg=rng.choice([0.0, 180.0], len(index)))
         fine, _ = place_map.read_fine_part(index.place_ids[0])
-        asked, one = technique.encode(picture), [0] if camera == "nadir" else None
+        descriptor, rotations = technique.encode(picture), [0] if camera == "nadir" else None
 
-        def encoded(places: PlaceIndex, expected: Expectation = NO_EXPECTATION) -> Query:
-            seen = technique.encode(picture)
-            return Query(technique=technique, descriptor=seen, place_map=place_map, index=places, expected=expected)
+        def encode(places: PlaceIndex, expected: Expectation = NO_EXPECTATION) -> Query:
+            encoded = technique.encode(picture)
+            return Query(technique=technique, descriptor=encoded, place_map=place_map, index=places, expected=expected)
 
-        def scanned(places: PlaceIndex) -> object:
-            return scan_index(encoded(places))
-
-        def query(expected: Expectation) -> object:
-            one = encoded(index, expected)
-            return compare_places(one, scan_index(one), technique.candidates)
+        def answer(expected: Expectation) -> object:
+            query = encode(index, expected)
+            return compare_places(query, scan_index(query), technique.candidates, 0.0)
 
         yield f"{name}: encode a frame", lambda: technique.encode(picture)
         yield f"{name}: read a place", lambda: place_map.read_fine_part(index.place_ids[1])
-        yield f"{name}: glance at a place", lambda: technique.score_quickly(asked, fine, one)
-        yield f"{name}: compare a place in full", lambda: technique.match(asked, fine, one)
-        yield f"{name}: encode, and scan {len(small)} places", lambda: scanned(small)
-        yield f"{name}: encode, and scan {len(index)} places", lambda: scanned(index)
-        yield f"{name}: a query", lambda: query(NO_EXPECTATION)
+        yield f"{name}: glance at a place", lambda: technique.score_quickly(descriptor, fine, rotations)
+        yield f"{name}: compare a place in full", lambda: technique.match(descriptor, fine, rotations)
+        yield f"{name}: encode, and scan {len(small)} places", lambda: scan_index(encode(small))
+        yield f"{name}: encode, and scan {len(index)} places", lambda: scan_index(encode(index))
+        yield f"{name}: a query", lambda: answer(NO_EXPECTATION)
         if camera == "nadir":
-            yield f"{name}: a query, heading known", lambda: query(known)
+            yield f"{name}: a query, heading known", lambda: answer(heading_known)
 
 
-def of_landmarks(picture: Image) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield what a flight does beside its queries: the landmarks of a frame, and its stride."""
+def list_landmark_parts(picture: Image) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield what a flight does besides queries: the landmarks of a frame, and its step of visual odometry."""
     moved = cv2.warpAffine(picture, np.float32([[1, 0, 40], [0, 1, 15]]), picture.shape[::-1])
     view = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0), focal=0.77)
     before, now = detect_landmarks(picture, None, QUERY_LANDMARKS), detect_landmarks(moved, None, QUERY_LANDMARKS)
 
-    def stride() -> object:
-        strides = VisualOdometry()
-        strides.measure(0.0, view, before)
-        if (found := strides.measure(1.0, view, now)) is None:
-            raise RuntimeError("no stride was found")
-        return found
+    def measure_step() -> object:
+        odometry = VisualOdometry()
+        odometry.measure(0.0, view, before)
+        if (step := odometry.measure(1.0, view, now)) is None:
+            raise RuntimeError("visual odometry found no step")
+        return step
 
     yield "flight: landmarks of a frame", lambda: detect_landmarks(moved, None, QUERY_LANDMARKS)
-    yield "flight: the stride since the frame before", stride
+    yield "flight: the stride since the frame before", measure_step
 
 
-def mark_each(*maps: str) -> None:
-    for name, work in parts(*maps):
+def run_parts(*maps: str) -> None:
+    for name, work in list_parts(*maps):
         work()
         os.getppid()
         work()
@@ -100,4 +97,4 @@ def mark_each(*maps: str) -> None:
 
 if __name__ == "__main__":
     cv2.setNumThreads(1)
-    mark_each(*sys.argv[1:])
+    run_parts(*sys.argv[1:])

@@ -25,10 +25,10 @@ from edgevpr.frames.level import Mount
 from edgevpr.lab.simulate.camera import CameraPose
 
 PICTURES_HZ = 5.0
-_LEAD_S = 0.08  # rendering takes 20 to 60 ms
-_UNIT = Fraction(1, 10_000)  # of the time stamps, in seconds
-_BEYOND_DEG = 60.0  # a picture that is tilted farther shows the sky
-_SLOPE_M = 80.0  # beyond the map, the ground comes to its other height on so many metres
+_RENDER_LEAD_S = 0.08  # rendering takes 20 to 60 ms
+_STAMP_UNIT_S = Fraction(1, 10_000)  # of the time stamps, in seconds
+_MAX_TILT_DEG = 60.0  # a picture that is tilted farther shows the sky
+_SLOPE_LENGTH_M = 80.0  # beyond the map, the ground comes to its other height on so many metres
 COLUMNS = ("t_s", "east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
 
 
@@ -56,7 +56,7 @@ class Camera:
         self._server.daemon_threads = True
         self._server.camera = self
         self.uri = f"http://127.0.0.1:{self._server.server_port}/"
-        self._threads = [threading.Thread(target=work) for work in (self._server.serve_forever, self._take)]
+        self._threads = [threading.Thread(target=work) for work in (self._server.serve_forever, self._take_pictures)]
 
     def __enter__(self) -> "Camera":
         for thread in self._threads:
@@ -70,54 +70,54 @@ class Camera:
             thread.join()
         self._server.server_close()
 
-    def next(self, after: int) -> Picture | None:
+    def wait_picture(self, after: int) -> Picture | None:
         """Wait for a picture after that of a number; None where the camera is off."""
         with self._changed:
             self._changed.wait_for(lambda: (self._picture and self._picture.number > after) or not self._is_on)
             return self._picture if self._is_on else None
 
-    def _take(self) -> None:
+    def _take_pictures(self) -> None:
         due_s = time.monotonic() + 1.0
         number = 0
         with open(self._log, "w", encoding="utf-8", buffering=1) as log:
             log.write(",".join(COLUMNS) + "\n")
             while self._is_on:
                 due_s = max(due_s + 1 / PICTURES_HZ, time.monotonic())  # what was missed is left out
-                time.sleep(max(0.0, due_s - _LEAD_S - time.monotonic()))
-                pose = self._truth.at(due_s)
+                time.sleep(max(0.0, due_s - _RENDER_LEAD_S - time.monotonic()))
+                pose = self._truth.compute_pose(due_s)
                 if pose is None:
                     continue
                 if not (self.is_frozen and self._picture):
-                    jpeg = self._rendered(pose)
+                    jpeg = self._render(pose)
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 number += 1
                 with self._changed:
                     self._picture = Picture(number, due_s, jpeg)
                     self._changed.notify_all()
-                where = (pose.east_m, pose.north_m, pose.height_m, pose.heading_deg, pose.roll_deg, pose.pitch_deg)
-                log.write(",".join((f"{due_s:.4f}", *(f"{each:.3f}" for each in where))) + "\n")
+                values = (pose.east_m, pose.north_m, pose.height_m, pose.heading_deg, pose.roll_deg, pose.pitch_deg)
+                log.write(",".join((f"{due_s:.4f}", *(f"{value:.3f}" for value in values))) + "\n")
         with self._changed:
             self._changed.notify_all()
 
-    def _rendered(self, pose: CameraPose) -> bytes:
+    def _render(self, pose: CameraPose) -> bytes:
         if self._scenario.is_blind:
-            return _noise(self._rng)
-        pose = replace(pose, height_m=max(pose.height_m * self._ground_scale(pose.north_m), 1.0))
+            return _make_noise_jpeg(self._rng)
+        pose = replace(pose, height_m=max(pose.height_m * self._compute_ground_scale(pose.north_m), 1.0))
         if self._scenario.is_level:
             pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)
-        elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _BEYOND_DEG:
+        elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _MAX_TILT_DEG:
             pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # nothing to be seen
-        return ground.picture(self._ground, mounted(pose, self._scenario.mount), "later", self._rng)
+        return ground.take_picture(self._ground, apply_mount(pose, self._scenario.mount), "later", self._rng)
 
-    def _ground_scale(self, north_m: float) -> float:
+    def _compute_ground_scale(self, north_m: float) -> float:
         """Return by how much farther below the ground lies there than where it is mapped."""
         if self._scenario.mapped_m is None:
             return 1.0
-        beyond = min(max((north_m - self._scenario.mapped_m) / _SLOPE_M, 0.0), 1.0)
+        beyond = min(max((north_m - self._scenario.mapped_m) / _SLOPE_LENGTH_M, 0.0), 1.0)
         return 1.0 + beyond * (self._scenario.beyond_scale - 1.0)
 
 
-def _noise(rng: np.random.Generator) -> bytes:
+def _make_noise_jpeg(rng: np.random.Generator) -> bytes:
     """Return a picture that no map knows, as a JPEG."""
     camera = ground.CAMERAS["later"]
     grains = rng.integers(0, 255, (camera.height // 8, camera.width // 8, 3), np.uint8)
@@ -125,7 +125,7 @@ def _noise(rng: np.random.Generator) -> bytes:
     return cv2.imencode(".jpg", noise)[1].tobytes()
 
 
-def mounted(pose: CameraPose, mount: Mount) -> CameraPose:
+def apply_mount(pose: CameraPose, mount: Mount) -> CameraPose:
     """Return the pose of a camera that is mounted so under an airframe of that pose."""
     about_down = cv2.Rodrigues(np.radians((0.0, 0.0, pose.heading_deg)))[0]
     body = Mount(pose.pitch_deg, -pose.roll_deg).body_from_straight()
@@ -150,11 +150,11 @@ class _Viewer(BaseHTTPRequestHandler):
                 self._send_parts()
 
     def _send_parts(self) -> None:
-        picture = self.server.camera.next(0)
+        picture = self.server.camera.wait_picture(0)
         while picture:
             head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n"
             self.wfile.write(head.encode() + picture.jpeg + b"\r\n")
-            picture = self.server.camera.next(picture.number)
+            picture = self.server.camera.wait_picture(picture.number)
 
     def _send_stamped(self) -> None:
         options = {"flush_packets": "1", "write_index": "0"}
@@ -162,16 +162,16 @@ class _Viewer(BaseHTTPRequestHandler):
             stream = container.add_stream("mjpeg", rate=int(PICTURES_HZ))
             camera = ground.CAMERAS["later"]
             stream.width, stream.height = camera.width, camera.height
-            stream.pix_fmt, stream.time_base = "yuvj420p", _UNIT
-            picture, began_s = self.server.camera.next(0), None
+            stream.pix_fmt, stream.time_base = "yuvj420p", _STAMP_UNIT_S
+            picture, began_s = self.server.camera.wait_picture(0), None
             while picture:
                 began_s = began_s or picture.t_mono_s
                 packet = av.Packet(picture.jpeg)
-                packet.stream, packet.time_base, packet.is_keyframe = stream, _UNIT, True
-                packet.pts = packet.dts = round((picture.t_mono_s - began_s) / _UNIT)
+                packet.stream, packet.time_base, packet.is_keyframe = stream, _STAMP_UNIT_S, True
+                packet.pts = packet.dts = round((picture.t_mono_s - began_s) / _STAMP_UNIT_S)
                 container.mux(packet)
                 self.wfile.flush()
-                picture = self.server.camera.next(picture.number)
+                picture = self.server.camera.wait_picture(picture.number)
 
 
 class _Sink:

@@ -6,11 +6,13 @@ from typing import Any
 
 from scenarios import AGP, GPS_INPUT, ODOMETRY, Scenario
 
-WATCHED_S, HEIGHT_M = 120.0, 100.0
+WATCH_S = 120.0
 MAP_END_M = 500.0  # north: what is flown over beyond it is in no map, where the ground changes its height
-CENTRE_M, RADIUS_M = (700.0, 500.0), 200.0  # of a plane's circle: half of it lies beyond that end
-HOVER_M, LEG_M = (600.0, 450.0), ((700.0, 320.0), (700.0, 900.0))
-HOME_M = (300.0, 500.0)  # of a plane
+CENTRE_M = (700.0, 500.0)  # of a plane's circle, half of which lies beyond that end
+RADIUS_M = 200.0
+HOVER_AT_M = (600.0, 450.0)  # of a copter
+LEG_M = ((700.0, 320.0), (700.0, 900.0))
+PLANE_HOME_M = (300.0, 500.0)
 ODOMETRY_SET = 2
 
 
@@ -25,12 +27,12 @@ class SetUp:
     config: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
-    def alone(self) -> str:
+    def control_name(self) -> str:
         """The name of the same autopilot without edgevpr."""
         return f"{'px4_' * self.is_px4}{self.vehicle}"
 
     @property
-    def sends_beside_gps(self) -> bool:
+    def sends_with_gps(self) -> bool:
         """True if edgevpr sends positions while the autopilot has GPS too."""
         return bool({"GPS2_TYPE", "VISO_TYPE"} & set(self.parameters))
 
@@ -82,18 +84,17 @@ class Flight:
     def has_edgevpr(self) -> bool:
         return bool(self.matches)
 
-    def scenario(self) -> Scenario:
+    def make_scenario(self) -> Scenario:
         """Return what the rig needs to know of it."""
         set_up, event = SET_UPS[self.set_up], EVENTS[self.event]
         # A map that is off claims the usual accuracy, not that of the rig, whose places are known to a metre.
         accuracy = {"min_accuracy_m": 5.0} if self.matches in ("displaced", "wrong") else {}
-        homes_m = {"plane": HOME_M, "copter": LEG_M[0] if event.leaves_map else HOVER_M}
+        homes_m = {"plane": PLANE_HOME_M, "copter": LEG_M[0] if event.leaves_map else HOVER_AT_M}
         return Scenario(
             vehicle=set_up.vehicle,
             is_px4=set_up.is_px4,
-            height_m=HEIGHT_M,
             home_m=homes_m[set_up.vehicle],
-            parameters={**_FLOWN_WITH[set_up.alone], **set_up.common},
+            parameters={**_VEHICLE_PARAMETERS[set_up.control_name], **set_up.common},
             with_edgevpr={} if event.parameters_come_late else set_up.parameters,
             config={**set_up.config, "mavlink": {**set_up.config.get("mavlink", {}), **accuracy}},
             mapped_m=MAP_END_M if event.leaves_map else None,
@@ -113,16 +114,16 @@ class Cell:
     def control(self) -> Flight:
         """The flight that it is compared with."""
         event = EVENTS[self.flight.event]
-        flown = event.control or self.flight.event
+        event_name = event.control or self.flight.event
         if event.control_has_edgevpr:
-            return replace(self.flight, event=flown)
-        return Flight(SET_UPS[self.flight.set_up].alone, flown)
+            return replace(self.flight, event=event_name)
+        return Flight(SET_UPS[self.flight.set_up].control_name, event_name)
 
 
 MATCHES = {"right": {}, "none": {"is_blind": True}, "displaced": {"map_east_m": 8.0}, "wrong": {"map_east_m": 300.0}}
 
-_WANDER = 0.3  # of the noise of PX4's receiver: at 1 a hover strays by 3 m, as much as a cell may be worse
-_FLOWN_WITH = {
+_GPS_WANDER_SHARE = 0.3  # of the noise of PX4's receiver: at 1 a hover strays by 3 m, as much as a cell may be worse
+_VEHICLE_PARAMETERS = {
     "copter": {"WPNAV_SPEED_UP": 500, "WPNAV_SPEED": 700, "GPS1_TYPE": 5, "SIM_GPS1_TYPE": 5},  # NMEA: a plain 3D fix
     "plane": {"TKOFF_ALT": 60, "WP_LOITER_RAD": RADIUS_M},
     "px4_copter": {
@@ -130,9 +131,9 @@ _FLOWN_WITH = {
         "MPC_Z_V_AUTO_UP": 5.0,
         "MPC_Z_VEL_MAX_UP": 5.0,
         "MPC_XY_CRUISE": 7.0,
-        "SIM_GPS_WANDER": _WANDER,
+        "SIM_GPS_WANDER": _GPS_WANDER_SHARE,
     },
-    "px4_plane": {"SIM_GPS_WANDER": _WANDER},
+    "px4_plane": {"SIM_GPS_WANDER": _GPS_WANDER_SHARE},
 }
 SET_UPS = {
     "copter": SetUp(),
@@ -156,8 +157,8 @@ SET_UPS = {
     "px4_plane_sensor": SetUp(is_px4=True, vehicle="plane", parameters=AGP),
 }
 
-_GPS_OFF, _GPS_ON = Step(0, "set_gps", (0,)), "set_gps"
-_DEAF_BY_THEN = (Step(20, "set_gps", (0,)),)
+_GPS_OFF = Step(0, "set_gps", (0,))
+_GPS_OFF_LATER = (Step(20, "set_gps", (0,)),)
 EVENTS = {
     "quiet": Event(),
     "4_satellites": Event(steps=(Step(0, "set_satellites", (4,)),)),
@@ -166,7 +167,7 @@ EVENTS = {
         steps=(Step(0, "set_satellites", (4,)), Step(60, "set_satellites", (10,))), gps_back_s=60.0
     ),
     "gps_off": Event(steps=(_GPS_OFF,)),
-    "gps_back": Event(steps=(_GPS_OFF, Step(50, _GPS_ON, (1,))), gps_back_s=50.0),
+    "gps_back": Event(steps=(_GPS_OFF, Step(50, "set_gps", (1,))), gps_back_s=50.0),
     "gps_flaps": Event(
         steps=tuple(Step(6.0 * number, "set_gps", (number % 2,)) for number in range(12)), gps_back_s=66.0
     ),
@@ -189,18 +190,18 @@ EVENTS = {
     ),
     "companion_restarts": Event(steps=(_GPS_OFF, Step(30, "restart_edgevpr"))),
     "companion_reboots_with_gps": Event(steps=(Step(0, "restart_edgevpr", (25,)),), control="quiet"),
-    "autopilot_reboots": Event(before=(("reboot", ()),), steps=_DEAF_BY_THEN, control="gps_off_20"),
+    "autopilot_reboots": Event(before=(("reboot", ()),), steps=_GPS_OFF_LATER, control="gps_off_20"),
     "set_up_late": Event(
-        before=(("adopt", ()), ("reboot", ())), steps=_DEAF_BY_THEN, control="gps_off_20", parameters_come_late=True
+        before=(("adopt", ()), ("reboot", ())), steps=_GPS_OFF_LATER, control="gps_off_20", parameters_come_late=True
     ),
-    "parameters_late": Event(before=(("lose_requests", (8,)),), steps=_DEAF_BY_THEN, control="gps_off_20"),
-    "gps_off_20": Event(steps=_DEAF_BY_THEN),
+    "parameters_late": Event(before=(("lose_requests", (8,)),), steps=_GPS_OFF_LATER, control="gps_off_20"),
+    "gps_off_20": Event(steps=_GPS_OFF_LATER),
     "other_stamps": Event(steps=(_GPS_OFF, Step(20, "send_other_stamps")), control="gps_off", control_has_edgevpr=True),
     "paused": Event(steps=(_GPS_OFF, Step(20, "pause")), control="gps_off", silent_s=22.0),
     "camera_freezes": Event(steps=(_GPS_OFF, Step(30, "freeze", (1,)), Step(90, "freeze", (0,))), control="gps_off"),
     "companion_busy": Event(steps=(_GPS_OFF, Step(30, "stop_edgevpr", (10,))), control="gps_off"),
     "companion_busy_with_gps": Event(steps=(Step(10, "stop_edgevpr", (10,)),), control="quiet"),
-    "link_saturated": Event(steps=(Step(0, "saturate", (2000,)), *_DEAF_BY_THEN), control="gps_off_20"),
+    "link_saturated": Event(steps=(Step(0, "saturate", (2000,)), *_GPS_OFF_LATER), control="gps_off_20"),
     "link_saturated_with_gps": Event(steps=(Step(0, "saturate", (2000,)),), control="quiet"),
     **{
         f"{word}_ground": Event(
@@ -214,53 +215,53 @@ EVENTS = {
 }
 
 
-def _cells(set_up: str, events: str, matches: str = "right") -> list[Cell]:
+def _make_cells(set_up: str, events: str, matches: str = "right") -> list[Cell]:
     """Return the cells of a set-up and several events; those with a `*` are of the quick part."""
-    each = ((event.rstrip("*"), event.endswith("*")) for event in events.split())
-    return [Cell(Flight(set_up, event, matches), is_quick) for event, is_quick in each]
+    names = ((event.rstrip("*"), event.endswith("*")) for event in events.split())
+    return [Cell(Flight(set_up, event, matches), is_quick) for event, is_quick in names]
 
 
 CELLS = {
     cell.flight.name: cell
     for cell in (
-        *_cells("gps_input", "4_satellites* 5_satellites satellites_back gps_back gps_flaps quiet", "none"),
-        *_cells("gps_input", "gps_drifts_fast link_saturated_with_gps companion_reboots_with_gps", "none"),
-        *_cells("gps_input", "4_satellites gps_back gps_jumps gps_drifts gps_drifts_fast home_set paused"),
-        *_cells("gps_input", "autopilot_reboots* set_up_late parameters_late companion_busy_with_gps"),
-        *_cells("gps_input", "camera_freezes companion_busy link_saturated lower_ground"),
-        *_cells("gps_input", "quiet", "displaced"),
-        *_cells("gps_input", "quiet gps_back", "wrong"),
-        *_cells("gps_input_never_switched", "4_satellites", "none"),
-        *_cells("gps_input_never_switched", "gps_back"),
-        *_cells("gps_input_blended", "quiet 4_satellites", "none"),
-        *_cells("gps_input_blended", "gps_back gps_jumps"),
-        *_cells("gps_input_blended", "quiet", "displaced"),
-        *_cells("gps_input_if_no_fix", "4_satellites", "none"),
-        *_cells("gps_input_if_no_fix", "gps_back"),
-        *_cells("gps_primary", "quiet*", "none"),
-        *_cells("gps_primary_never_switched", "quiet", "none"),
-        *_cells("affinity", "4_satellites", "none"),
-        *_cells("affinity", "gps_back"),
-        *_cells("affinity_ours", "quiet", "none"),
-        *_cells("odometry", "source_set", "none"),
-        *_cells("odometry", "source_set* source_set_and_back 4_satellites"),
-        *_cells("odometry", "source_set", "displaced"),
-        *_cells("odometry", "source_set", "wrong"),
-        *_cells("odometry_switched", "gps_back gps_jumps"),
-        *_cells("odometry_switched", "gps_back", "wrong"),
-        *_cells("plane_command", "gps_back gps_jumps gps_drifts_fast home_set companion_reboots other_stamps"),
-        *_cells("plane_command", "lower_ground"),
-        *_cells("plane_command", "gps_back", "wrong"),
-        *_cells("plane_gps_input", "4_satellites", "none"),
-        *_cells("plane_gps_input", "gps_back gps_drifts_fast"),
-        *_cells("px4_sensor", "5_satellites gps_back", "none"),
-        *_cells("px4_sensor", "gps_back gps_jumps gps_drifts gps_spoofed home_set origin_set paused"),
-        *_cells("px4_sensor", "autopilot_reboots set_up_late companion_busy lower_ground* higher_ground"),
-        *_cells("px4_sensor", "gps_unused quiet", "displaced"),
-        *_cells("px4_sensor", "gps_back", "wrong"),
-        *_cells("px4_odometry", "gps_back gps_spoofed lower_ground"),
-        *_cells("px4_odometry", "gps_unused", "displaced"),
-        *_cells("px4_plane_sensor", "gps_back gps_spoofed home_set lower_ground"),
-        *_cells("px4_plane_sensor", "gps_back", "wrong"),
+        *_make_cells("gps_input", "4_satellites* 5_satellites satellites_back gps_back gps_flaps quiet", "none"),
+        *_make_cells("gps_input", "gps_drifts_fast link_saturated_with_gps companion_reboots_with_gps", "none"),
+        *_make_cells("gps_input", "4_satellites gps_back gps_jumps gps_drifts gps_drifts_fast home_set paused"),
+        *_make_cells("gps_input", "autopilot_reboots* set_up_late parameters_late companion_busy_with_gps"),
+        *_make_cells("gps_input", "camera_freezes companion_busy link_saturated lower_ground"),
+        *_make_cells("gps_input", "quiet", "displaced"),
+        *_make_cells("gps_input", "quiet gps_back", "wrong"),
+        *_make_cells("gps_input_never_switched", "4_satellites", "none"),
+        *_make_cells("gps_input_never_switched", "gps_back"),
+        *_make_cells("gps_input_blended", "quiet 4_satellites", "none"),
+        *_make_cells("gps_input_blended", "gps_back gps_jumps"),
+        *_make_cells("gps_input_blended", "quiet", "displaced"),
+        *_make_cells("gps_input_if_no_fix", "4_satellites", "none"),
+        *_make_cells("gps_input_if_no_fix", "gps_back"),
+        *_make_cells("gps_primary", "quiet*", "none"),
+        *_make_cells("gps_primary_never_switched", "quiet", "none"),
+        *_make_cells("affinity", "4_satellites", "none"),
+        *_make_cells("affinity", "gps_back"),
+        *_make_cells("affinity_ours", "quiet", "none"),
+        *_make_cells("odometry", "source_set", "none"),
+        *_make_cells("odometry", "source_set* source_set_and_back 4_satellites"),
+        *_make_cells("odometry", "source_set", "displaced"),
+        *_make_cells("odometry", "source_set", "wrong"),
+        *_make_cells("odometry_switched", "gps_back gps_jumps"),
+        *_make_cells("odometry_switched", "gps_back", "wrong"),
+        *_make_cells("plane_command", "gps_back gps_jumps gps_drifts_fast home_set companion_reboots other_stamps"),
+        *_make_cells("plane_command", "lower_ground"),
+        *_make_cells("plane_command", "gps_back", "wrong"),
+        *_make_cells("plane_gps_input", "4_satellites", "none"),
+        *_make_cells("plane_gps_input", "gps_back gps_drifts_fast"),
+        *_make_cells("px4_sensor", "5_satellites gps_back", "none"),
+        *_make_cells("px4_sensor", "gps_back gps_jumps gps_drifts gps_spoofed home_set origin_set paused"),
+        *_make_cells("px4_sensor", "autopilot_reboots set_up_late companion_busy lower_ground* higher_ground"),
+        *_make_cells("px4_sensor", "gps_unused quiet", "displaced"),
+        *_make_cells("px4_sensor", "gps_back", "wrong"),
+        *_make_cells("px4_odometry", "gps_back gps_spoofed lower_ground"),
+        *_make_cells("px4_odometry", "gps_unused", "displaced"),
+        *_make_cells("px4_plane_sensor", "gps_back gps_spoofed home_set lower_ground"),
+        *_make_cells("px4_plane_sensor", "gps_back", "wrong"),
     )
 }

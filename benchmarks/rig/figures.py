@@ -3,29 +3,26 @@
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from base import Row
 
 from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.runtime.flight.flightlog import read_log
 
 ROLL_DEG = ((0, 6), (6, 20), (20, 90))
-AFTER_S = (10, 30, 60, 120, 180, 240, 300)
-_TAKEN_WITHIN_S = 0.05  # a query belongs to the picture of its time
+AFTER_LOSS_S = (10, 30, 60, 120, 180, 240, 300)
+_MAX_PICTURE_OFFSET_S = 0.05  # a query belongs to the picture of its time
 _ALARMS = ("failsafe", "variance", "stopped aiding", "crash", "emergency")
 
 
-Row = dict[str, Any]
-
-
-def spread(values: np.ndarray) -> Row:
+def summarise(values: np.ndarray) -> Row:
     """Return number, median, 90 % and maximum of errors in metres."""
     if len(values) == 0:
         return {"n": 0}
     median, p90, largest = np.quantile(values, (0.5, 0.9, 1.0))
-    found = {"median": median, "p90": p90, "max": largest}
-    return {"n": len(values), **{name: round(float(value), 1) for name, value in found.items()}}
+    figures = {"median": median, "p90": p90, "max": largest}
+    return {"n": len(values), **{name: round(float(value), 1) for name, value in figures.items()}}
 
 
 def read_table(path: Path) -> np.ndarray:
@@ -35,13 +32,14 @@ def read_table(path: Path) -> np.ndarray:
     return np.atleast_1d(np.genfromtxt(lines, columns, delimiter=",")) if lines else np.empty(0, columns)
 
 
-def figures_of(folder: Path) -> Row:
+def compute_run_figures(folder: Path) -> Row:
     """Return the figures of the run in a folder."""
     run = json.loads((folder / "run.json").read_text())
     track, loss_s = read_table(folder / "track.csv"), run["marks_s"]["loss"]
     log = list(read_log(folder / "flight.jsonl")) if (folder / "flight.jsonl").exists() else []
-    found: Row = {"commit": run["commit"], "estimate": _estimate(track, loss_s), "modes": _modes(track, loss_s)}
-    found["alarms"] = [
+    figures: Row = {"commit": run["commit"]}
+    figures |= {"estimate": _score_estimate(track, loss_s), "modes": _list_modes(track, loss_s)}
+    figures["alarms"] = [
         [round(t_s - loss_s, 1), text]
         for t_s, sender, text in run["texts"]
         if sender == 1 and any(word in text.lower() for word in _ALARMS)
@@ -49,29 +47,29 @@ def figures_of(folder: Path) -> Row:
     if log:
         pictures, sent = read_table(folder / "pictures.csv"), read_table(folder / "sent.csv")
         queries = [line for line in log if line["kind"] == "query"]
-        found["fixes"] = _fixes(pictures, queries)
-        found["sent"] = _sent(sent[sent["t_s"] >= loss_s])
-        found["wire_ms"] = _wire_ms(sent, queries)
-        found["answers"] = dict(log[-1].get("mavlink", {}).get("acks", {}))
-        found["queries"] = len(queries)
-        found["accepted"] = sum(line["accepted"] for line in queries)
-        ages_s = np.array([line["t_mono_s"] - line["t_frame_s"] for line in queries])
-        found["query_ms"] = [round(1e3 * float(each)) for each in np.quantile(ages_s, (0.5, 0.99))] if queries else None
-        found["gap"] = _longest_gap(sent, pictures, [q["t_frame_s"] for q in queries if q["accepted"]], loss_s)
-        found["gps_alarms_s"] = [
+        figures["fixes"] = _score_fixes(pictures, queries)
+        figures["sent"] = _score_sent(sent[sent["t_s"] >= loss_s])
+        figures["wire_ms"] = _measure_wire_ms(sent, queries)
+        figures["answers"] = dict(log[-1].get("mavlink", {}).get("acks", {}))
+        figures["queries"] = len(queries)
+        figures["accepted"] = sum(line["accepted"] for line in queries)
+        ages_ms = [1e3 * (line["t_mono_s"] - line["t_frame_s"]) for line in queries]
+        figures["query_ms"] = np.quantile(ages_ms, (0.5, 0.99)).round().astype(int).tolist() if queries else None
+        figures["gap"] = _find_longest_gap(sent, pictures, [q["t_frame_s"] for q in queries if q["accepted"]], loss_s)
+        figures["gps_alarms_s"] = [
             round(line["t_mono_s"] - loss_s, 1) for line in log if line["kind"] == "gps" and line["is_wrong"]
         ]
-    return found
+    return figures
 
 
-def by_second(track: np.ndarray, loss_s: float) -> np.ndarray:
+def max_per_second(track: np.ndarray, loss_s: float) -> np.ndarray:
     """Return the largest error of the estimate in each second after the loss; NaN where there is no line."""
     seconds = np.floor(track["t_s"] - loss_s).astype(int)
     last = int(seconds.max(initial=-1))
     return np.array([track["error_m"][seconds == second].max(initial=-math.inf) for second in range(last + 1)])
 
 
-def worse_by(with_edgevpr: np.ndarray, without: np.ndarray) -> tuple[float, int] | None:
+def compare_estimates(with_edgevpr: np.ndarray, without: np.ndarray) -> tuple[float, int] | None:
     """Return by how many metres, at the worst second after the loss, the estimate is worse than in the flight without
     edgevpr, and that second."""
     length = min(len(with_edgevpr), len(without))
@@ -81,42 +79,43 @@ def worse_by(with_edgevpr: np.ndarray, without: np.ndarray) -> tuple[float, int]
     return round(float(beyond_m.max()), 1), int(beyond_m.argmax())
 
 
-def _estimate(track: np.ndarray, loss_s: float) -> Row:
+def _score_estimate(track: np.ndarray, loss_s: float) -> Row:
     after_s, error_m = track["t_s"] - loss_s, track["error_m"]
     over_s = after_s[-1] + 0.5
-    at = {str(each): round(float(np.interp(each, after_s, error_m)), 1) for each in AFTER_S if each <= over_s}
-    return {"after": spread(error_m[after_s >= 0]), "at_s": at}
+    times_s = [time_s for time_s in AFTER_LOSS_S if time_s <= over_s]
+    at_s = {str(time_s): round(float(np.interp(time_s, after_s, error_m)), 1) for time_s in times_s}
+    return {"after": summarise(error_m[after_s >= 0]), "at_s": at_s}
 
 
-def _modes(track: np.ndarray, loss_s: float) -> list[list[float]]:
+def _list_modes(track: np.ndarray, loss_s: float) -> list[list[float]]:
     """Return [seconds after the loss, number of the mode], at the loss and at each change after it."""
     after = track[track["t_s"] >= loss_s]
     changes = [0, *(np.flatnonzero(np.diff(after["mode"])) + 1)] if len(after) else []
-    return [[round(float(after["t_s"][each] - loss_s), 1), int(after["mode"][each])] for each in changes]
+    return [[round(float(after["t_s"][row] - loss_s), 1), int(after["mode"][row])] for row in changes]
 
 
-def _fixes(pictures: np.ndarray, queries: list[Row]) -> Row:
+def _score_fixes(pictures: np.ndarray, queries: list[Row]) -> Row:
     """Return how well the accepted matches are met by the true places of their own pictures."""
     off_m, roll_deg, claimed_m = [], [], []
     for line in queries:
-        of = pictures[np.argmin(abs(pictures["t_s"] - line["t_frame_s"]))]
+        picture = pictures[np.argmin(abs(pictures["t_s"] - line["t_frame_s"]))]
         is_tilted = line.get("view", {}).get("reason")  # too far to be sent
         if not line["accepted"] or not line["located"] or is_tilted:
             continue
-        if abs(of["t_s"] - line["t_frame_s"]) > _TAKEN_WITHIN_S:
+        if abs(picture["t_s"] - line["t_frame_s"]) > _MAX_PICTURE_OFFSET_S:
             continue
         east_m, north_m = to_metres(line["located"]["lat_deg"], line["located"]["lon_deg"])
-        off_m.append((east_m - of["east_m"], north_m - of["north_m"]))
-        roll_deg.append(abs(of["roll_deg"]))
+        off_m.append((east_m - picture["east_m"], north_m - picture["north_m"]))
+        roll_deg.append(abs(picture["roll_deg"]))
         claimed_m.append(line["accuracy_m"])
     if not off_m:
-        return {"error": spread(np.array([]))}
+        return {"error": summarise(np.array([]))}
     error_m, rolls_deg = np.hypot(*np.transpose(off_m)), np.array(roll_deg)
-    by_roll = {f"{low}-{high}": spread(error_m[(rolls_deg >= low) & (rolls_deg < high)]) for low, high in ROLL_DEG}
-    return {"error": spread(error_m), "by_roll_deg": by_roll, **_claims(np.array(off_m), np.array(claimed_m))}
+    by_roll = {f"{low}-{high}": summarise(error_m[(rolls_deg >= low) & (rolls_deg < high)]) for low, high in ROLL_DEG}
+    return {"error": summarise(error_m), "by_roll_deg": by_roll, **_score_claims(np.array(off_m), np.array(claimed_m))}
 
 
-def _claims(off_m: np.ndarray, claimed_m: np.ndarray) -> Row:
+def _score_claims(off_m: np.ndarray, claimed_m: np.ndarray) -> Row:
     """Return the median of the accuracies claimed, and the shares of errors, axis by axis, within one and two sigma of
     them."""
     sigmas = abs(off_m) / np.maximum(claimed_m, 1e-3)[:, None]
@@ -124,44 +123,44 @@ def _claims(off_m: np.ndarray, claimed_m: np.ndarray) -> Row:
     return {"claimed_m": round(float(np.median(claimed_m)), 2), "within": within}
 
 
-def _sent(sent: np.ndarray) -> Row:
+def _score_sent(sent: np.ndarray) -> Row:
     """Return, by the name of the message, how well the positions that were sent are met by the true ones of their
     times."""
-    found = {}
+    figures = {}
     for kind in np.unique(sent["kind"]):
         rows = sent[sent["kind"] == kind]
         if len(rows) < 2:
             continue
         off_m = np.stack((rows["east_m"] - rows["true_east_m"], rows["north_m"] - rows["true_north_m"]), axis=1)
         rate_hz = round(len(rows) / float(np.ptp(rows["t_s"])), 1)
-        claims = _claims(off_m, rows["accuracy_m"])
-        found[str(kind)] = {"rate_hz": rate_hz, "error": spread(np.hypot(*off_m.T)), **claims}
-    return found
+        claims = _score_claims(off_m, rows["accuracy_m"])
+        figures[str(kind)] = {"rate_hz": rate_hz, "error": summarise(np.hypot(*off_m.T)), **claims}
+    return figures
 
 
-def _longest_gap(sent: np.ndarray, pictures: np.ndarray, accepted_s: list[float], loss_s: float) -> Row | None:
+def _find_longest_gap(sent: np.ndarray, pictures: np.ndarray, accepted_s: list[float], loss_s: float) -> Row | None:
     """Return the longest time without a match after the loss: its seconds, the metres flown in it, and by how much what
     was sent last in it is wrong, metres (None: nothing was sent in it)."""
-    bounds_s = np.array([loss_s, *(each for each in accepted_s if each > loss_s), pictures["t_s"][-1]])
+    bounds_s = np.array([loss_s, *(time_s for time_s in accepted_s if time_s > loss_s), pictures["t_s"][-1]])
     longest = int(np.diff(bounds_s).argmax())
     from_s, to_s = bounds_s[longest : longest + 2]
-    flown = pictures[(pictures["t_s"] >= from_s) & (pictures["t_s"] <= to_s)]
-    told = sent[(sent["t_s"] > from_s) & (sent["t_s"] <= to_s)]
-    way_m = float(np.hypot(np.diff(flown["east_m"]), np.diff(flown["north_m"])).sum())
-    found: Row = {"s": round(float(to_s - from_s), 1), "way_m": round(way_m), "off_m": None}
-    if len(told):
-        last = told[-1]
+    route = pictures[(pictures["t_s"] >= from_s) & (pictures["t_s"] <= to_s)]
+    sent_in_gap = sent[(sent["t_s"] > from_s) & (sent["t_s"] <= to_s)]
+    way_m = float(np.hypot(np.diff(route["east_m"]), np.diff(route["north_m"])).sum())
+    gap: Row = {"s": round(float(to_s - from_s), 1), "way_m": round(way_m), "off_m": None}
+    if len(sent_in_gap):
+        last = sent_in_gap[-1]
         off_m = math.hypot(last["east_m"] - last["true_east_m"], last["north_m"] - last["true_north_m"])
-        found |= {"off_m": round(off_m, 1), "told_s": round(float(last["t_s"] - from_s), 1)}
-    return found
+        gap |= {"off_m": round(off_m, 1), "told_s": round(float(last["t_s"] - from_s), 1)}
+    return gap
 
 
-def _wire_ms(sent: np.ndarray, queries: list[Row]) -> list[float] | None:
+def _measure_wire_ms(sent: np.ndarray, queries: list[Row]) -> list[float] | None:
     """Return how long it takes from a picture to the bytes of its fix on the wire, median and 99 %."""
     sent_s = sent["t_s"][sent["kind"] == "COMMAND_INT"]
     took_ms = [
-        1e3 * float(each - line["t_frame_s"])
+        1e3 * float(time_s - line["t_frame_s"])
         for line in queries
-        for each in sent_s[(sent_s > line["t_frame_s"]) & (sent_s <= line["t_mono_s"])]
+        for time_s in sent_s[(sent_s > line["t_frame_s"]) & (sent_s <= line["t_mono_s"])]
     ]
-    return [round(float(each), 1) for each in np.quantile(took_ms, (0.5, 0.99))] if took_ms else None
+    return [round(float(time_s), 1) for time_s in np.quantile(took_ms, (0.5, 0.99))] if took_ms else None

@@ -16,8 +16,6 @@ from camera import Camera
 from px4 import GROUND_ALT_M, Px4
 from recording import Recorder
 from scenarios import (
-    CIRCUIT_M,
-    CLIMB_M,
     COPTER_CIRCUIT_M,
     COPTER_HOME_M,
     COPTER_SPEED_M_S,
@@ -25,19 +23,19 @@ from scenarios import (
     VEHICLE_PARAMETERS,
     WIND_FROM_DEG,
     Scenario,
-    scenario_of,
+    parse_flight_name,
 )
-from simulator import Simulator, mission
+from simulator import Simulator, make_mission
 from truth import Truth
 
 from edgevpr.mavlink.wire import mavlink
 
-_STEP_S = 0.1
-_OTHER_CLOCK = (
+LOOP_STEP_S = 0.1
+_SHIFTED_CLOCK_SCRIPT = (
     "import runpy, time; own, ahead = time.monotonic, {} - time.monotonic(); time.monotonic = lambda: own() + ahead; "
     "runpy.run_module('edgevpr', None, '__main__')"
 )
-_ONLY_VELOCITY = 0b0000110111000111  # of SET_POSITION_TARGET_LOCAL_NED: position, acceleration and yaw do not count
+_VELOCITY_MASK = 0b0000110111000111  # of SET_POSITION_TARGET_LOCAL_NED: position, acceleration and yaw do not count
 
 
 class Run:
@@ -64,37 +62,38 @@ class Run:
             self._take_off()
             self._start_edgevpr()
             self._watch(self._scenario.gps_s)
-            self._lose()
+            self._remove_gps()
             self._watch(self._scenario.off_s)
-        run = {"commit": base.commit(ground.CHECKOUT), "marks_s": self._marks_s, "texts": self._recorder.texts}
+        run = {"commit": base.read_commit(ground.CHECKOUT), "marks_s": self._marks_s, "texts": self._recorder.texts}
         (self._folder / "run.json").write_text(json.dumps(run))
         return self._folder
 
     def _equip(self, stack: ExitStack) -> None:
         """Start the simulator and the camera, lay the wire between them, and write edgevpr's configuration."""
-        scenario, folder, own = self._scenario, self._folder, {} if self._is_control else self._scenario.with_edgevpr
+        scenario, folder = self._scenario, self._folder
         home_m = scenario.home_m or (COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M)
-        parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters, **own}
-        listeners = [self._truth.listen, self._recorder.listen]
+        parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters}
+        parameters |= {} if self._is_control else scenario.with_edgevpr
+        listeners = [self._truth.handle_message, self._recorder.handle_message]
         make = Px4 if scenario.is_px4 else Simulator
         stack.callback(self._recorder.close)
         simulator = make(scenario.vehicle, folder / "simulator", home_m, parameters, listeners, self._instance)
         self._simulator = stack.enter_context(simulator)
         if not self._is_control:
-            lit = ground.lit_ground(self._work, "later")
-            seed = ground.SEED + scenario_of(folder.name)[1]
+            lit = ground.load_ground(self._work, "later")
+            seed = ground.SEED + parse_flight_name(folder.name)[1]
             self._camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, scenario))
-            self._relay = stack.enter_context(simulator.relay(self._truth, folder / "sent.csv", home_m))
-            config = self._config(self._place_map(), self._camera.uri, self._relay.uri)
+            self._relay = stack.enter_context(simulator.make_relay(self._truth, folder / "sent.csv", home_m))
+            config = self._make_config(self._prepare_map(), self._camera.uri, self._relay.uri)
             (folder / "config.yaml").write_text(json.dumps(config, indent=1))  # JSON is YAML
         stack.callback(self._end_edgevpr)
 
-    def _place_map(self) -> Path:
+    def _prepare_map(self) -> Path:
         """Return the map of the ground, by the altitude of the simulator's."""
         scenario = self._scenario
-        place_map = ground.place_map(self._work, scenario.height_m, scenario.mapped_m)
+        place_map = ground.build_place_map(self._work, scenario.height_m, scenario.mapped_m)
         up_m = GROUND_ALT_M - ground.GROUND_ALT_M if scenario.is_px4 else 0.0
-        return ground.moved_map(place_map, scenario.map_east_m, up_m)
+        return ground.move_map(place_map, scenario.map_east_m, up_m)
 
     def _start_edgevpr(self, clock_s: float | None = None) -> None:
         """Start edgevpr, unless it runs or is not to be in this flight; a `clock_s` is that of its computer."""
@@ -102,10 +101,10 @@ class Run:
             return
         module = ["-m", "edgevpr"]
         if clock_s is not None:
-            module = ["-c", _OTHER_CLOCK.format(clock_s)]
+            module = ["-c", _SHIFTED_CLOCK_SCRIPT.format(clock_s)]
         command = [sys.executable, *module, "run", "--config", str(self._folder / "config.yaml")]
-        with open(self._folder / "edgevpr.txt", "a", encoding="utf-8") as said:
-            self._edgevpr = subprocess.Popen(command, stdout=said, stderr=said, env=ground.environment())
+        with open(self._folder / "edgevpr.txt", "a", encoding="utf-8") as output:
+            self._edgevpr = subprocess.Popen(command, stdout=output, stderr=output, env=ground.make_environment())
 
     def _end_edgevpr(self) -> None:
         if self._edgevpr:
@@ -116,7 +115,7 @@ class Run:
                 self._edgevpr.kill()
                 self._edgevpr.wait()
 
-    def _config(self, place_map: Path, uri: str, link: str) -> dict[str, Any]:
+    def _make_config(self, place_map: Path, uri: str, link: str) -> dict[str, Any]:
         config: dict[str, Any] = {
             "map": str(place_map),
             "source": {"uri": uri, "camera": "nadir", "rate_hz": 1.0, "fov_deg": ground.FOV_DEG},
@@ -135,7 +134,7 @@ class Run:
             return
         simulator.wait_ready()
         if self._scenario.vehicle == "plane":
-            simulator.link.upload(mission(HOME_M, CLIMB_M, CIRCUIT_M, self._scenario.height_m))
+            simulator.link.upload_mission(make_mission(self._scenario.height_m))
             simulator.arm("AUTO")
         else:
             simulator.arm("GUIDED")
@@ -143,7 +142,7 @@ class Run:
         simulator.wait_height(0.95 * self._scenario.height_m)
         self._recorder.is_on = True
 
-    def _lose(self) -> None:
+    def _remove_gps(self) -> None:
         scenario, simulator = self._scenario, self._simulator
         self._marks_s["loss"] = time.monotonic()
         if scenario.loses_gps:
@@ -159,30 +158,30 @@ class Run:
         """Let the flight go on for so long; a copter is steered meanwhile, and ends where it has landed."""
         began_s = time.monotonic()
         while (now_s := time.monotonic()) < began_s + seconds:
-            if self._scenario.vehicle == "copter" and (self._is_down() if self._scenario.is_px4 else self._steer()):
+            if self._scenario.vehicle == "copter" and (self._has_landed() if self._scenario.is_px4 else self._steer()):
                 return
             if self._scenario.glitch_m_s and "loss" in self._marks_s:
                 away_m = self._scenario.glitch_m_s * (now_s - self._marks_s["loss"])
                 self._simulator.displace_gps(away_m)
-            time.sleep(_STEP_S)
+            time.sleep(LOOP_STEP_S)
 
-    def _is_down(self) -> bool:
-        at = self._truth.at(time.monotonic())
-        return at is not None and at.height_m < 1.0
+    def _has_landed(self) -> bool:
+        pose = self._truth.compute_pose(time.monotonic())
+        return pose is not None and pose.height_m < 1.0
 
     def _steer(self) -> bool:
         """Send a copter on towards the next corner as a pilot who sees it would, by velocity; tell whether it has
         landed."""
-        at = self._truth.at(time.monotonic())
-        if at is None:
+        pose = self._truth.compute_pose(time.monotonic())
+        if pose is None:
             return False
         east_m, north_m = COPTER_CIRCUIT_M[self._corner % len(COPTER_CIRCUIT_M)]
-        east_m, north_m = east_m - at.east_m, north_m - at.north_m
+        east_m, north_m = east_m - pose.east_m, north_m - pose.north_m
         away_m = max(math.hypot(east_m, north_m), 0.1)
         if away_m < 3 * COPTER_SPEED_M_S:
             self._corner += 1
-        east, north = (COPTER_SPEED_M_S * each / away_m for each in (east_m, north_m))
-        down = max(-2.0, min(2.0, 0.5 * (at.height_m - self._scenario.height_m)))
-        target = (0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, _ONLY_VELOCITY, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0)
+        east, north = (COPTER_SPEED_M_S * offset_m / away_m for offset_m in (east_m, north_m))
+        down = max(-2.0, min(2.0, 0.5 * (pose.height_m - self._scenario.height_m)))
+        target = (0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, _VELOCITY_MASK, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0)
         self._simulator.link.send(mavlink.MAVLink_set_position_target_local_ned_message(*target))
-        return at.height_m < 1.0
+        return pose.height_m < 1.0

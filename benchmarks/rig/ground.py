@@ -19,9 +19,13 @@ from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.places.mapfile import PlaceMap
 
 CHECKOUT = Path(os.environ.get("EDGEVPR_CHECKOUT") or Path(__file__).parents[2]).resolve()  # the edgevpr that flies
-WIDTH_M, DEPTH_M, METRES_PER_PIXEL, SEED = 1400.0, 1000.0, 0.2, 16
+WIDTH_M = 1400.0
+DEPTH_M = 1000.0
+METRES_PER_PIXEL = 0.2
+SEED = 16
 GROUND_ALT_M = ORIGIN.alt_m
-SPACING_M, EDGE_M = 30.0, 50.0
+PICTURE_SPACING_M = 30.0
+EDGE_MARGIN_M = 50.0
 CAMERAS = {"mapping": Camera(), "later": Camera(noise_sigma=3.0, blur_px=2.0)}
 LIGHTS = {
     "mapping": Light(sun_azimuth_deg=52, sun_elevation_deg=50, exposure=1.1),
@@ -32,7 +36,7 @@ LIGHTS = {
 FOV_DEG = round(float(np.degrees(2 * np.arctan(Camera().width / 2 / Camera().focal_px))), 2)
 
 
-def lit_ground(work: Path, day: str) -> np.ndarray:
+def load_ground(work: Path, day: str) -> np.ndarray:
     """Return the ground in the light of a day, uint8 (H, W, 3) BGR, read from its file only where it is looked at."""
     files = {name: work / f"ground-{name}.npy" for name in LIGHTS}
     if not all(path.exists() for path in files.values()):
@@ -45,7 +49,7 @@ def lit_ground(work: Path, day: str) -> np.ndarray:
     return np.load(files[day], mmap_mode="r")
 
 
-def from_rasters(work: Path, mapped: Path, later: Path, height_m: float) -> Path:
+def make_raster_ground(work: Path, mapped: Path, later: Path, height_m: float) -> Path:
     """Return the folder of a ground of two pictures from space, of the map's day and of the flight's, in metres and of
     the same place, to be flown over at a height. They lie in its middle; beyond them there is nothing."""
     folder = work / f"{mapped.stem}-{later.stem}-{height_m:g}m"
@@ -54,17 +58,17 @@ def from_rasters(work: Path, mapped: Path, later: Path, height_m: float) -> Path
         if not (folder / f"ground-{name}.npy").exists():
             with rasterio.open(path) as raster:
                 high, wide = (round(size * raster.res[0] / METRES_PER_PIXEL) for size in raster.shape)
-                seen = raster.read((3, 2, 1), out_shape=(3, high, wide), resampling=rasterio.enums.Resampling.cubic)
+                bands = raster.read((3, 2, 1), out_shape=(3, high, wide), resampling=rasterio.enums.Resampling.cubic)
             ground = np.zeros((round(DEPTH_M / METRES_PER_PIXEL), round(WIDTH_M / METRES_PER_PIXEL), 3), np.uint8)
             rows, columns = min(high, len(ground)), min(wide, ground.shape[1])
             top, left, skipped = (len(ground) - rows) // 2, (ground.shape[1] - columns) // 2, (wide - columns) // 2
-            shown = seen.transpose(1, 2, 0)[(high - rows) // 2 :][:rows, skipped : skipped + columns]
-            ground[top : top + rows, left : left + columns] = shown
+            part = bands.transpose(1, 2, 0)[(high - rows) // 2 :][:rows, skipped : skipped + columns]
+            ground[top : top + rows, left : left + columns] = part
             np.save(folder / f"ground-{name}.npy", ground)
     return folder
 
 
-def picture(ground: np.ndarray, pose: CameraPose, day: str, rng: np.random.Generator) -> bytes:
+def take_picture(ground: np.ndarray, pose: CameraPose, day: str, rng: np.random.Generator) -> bytes:
     """Take a picture with the camera of that day, as a JPEG."""
     camera = CAMERAS[day]
     # Beyond its edge there is nothing: mirrored ground would be recognised, turned by 180 degrees.
@@ -72,41 +76,42 @@ def picture(ground: np.ndarray, pose: CameraPose, day: str, rng: np.random.Gener
     return cv2.imencode(".jpg", frame, (cv2.IMWRITE_JPEG_QUALITY, camera.jpeg_quality))[1].tobytes()
 
 
-def environment() -> dict[str, str]:
+def make_environment() -> dict[str, str]:
     """Return the environment in which `python -m edgevpr` is the code of CHECKOUT, on one core as on a board."""
     return {**os.environ, "PYTHONPATH": str(CHECKOUT), "OPENBLAS_NUM_THREADS": "1"}
 
 
-def place_map(work: Path, height_m: float, mapped_m: float | None = None) -> Path:
+def build_place_map(work: Path, height_m: float, mapped_m: float | None = None) -> Path:
     """Return the map of the ground, up to `mapped_m` north (None: all of it): `edgevpr map build` makes it of the
     pictures of a mapping flight, a gimbal's, with their true positions, from the height of the flight."""
     part = "" if mapped_m is None else f"-{mapped_m:.0f}m"
     path, folder = work / f"ground{part}.gpkg", work / f"mapping{part}"
     if path.exists():
         return path
-    ground = lit_ground(work, "mapping")
+    ground = load_ground(work, "mapping")
     (folder / "images").mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(SEED)
     with open(folder / "positions.csv", "w", newline="", encoding="utf-8") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon", "alt", "height_m", "yaw_deg"))
-        poses = [pose for pose in _mapping_poses(rng, height_m) if mapped_m is None or pose.north_m <= mapped_m]
+        poses = [pose for pose in _plan_mapping_poses(rng, height_m) if mapped_m is None or pose.north_m <= mapped_m]
         for number, pose in enumerate(poses):
-            name, at = f"{number:05d}.jpg", to_position(pose)
-            (folder / "images" / name).write_bytes(picture(ground, pose, "mapping", rng))
-            where = (f"{at.lat_deg:.8f}", f"{at.lon_deg:.8f}", f"{at.alt_m:.2f}", f"{pose.height_m:.2f}")
-            table.writerow((name, *where, f"{pose.heading_deg % 360:.2f}"))
+            name, position = f"{number:05d}.jpg", to_position(pose)
+            (folder / "images" / name).write_bytes(take_picture(ground, pose, "mapping", rng))
+            degrees = (f"{position.lat_deg:.8f}", f"{position.lon_deg:.8f}")
+            rest = (position.alt_m, pose.height_m, pose.heading_deg % 360)
+            table.writerow((name, *degrees, *(f"{value:.2f}" for value in rest)))
     unfinished = work / f"unfinished-{os.getpid()}.gpkg"
     unfinished.unlink(missing_ok=True)
     pictures = ("--images", folder / "images", "--positions", folder / "positions.csv", "--camera", "nadir")
     command = ("map", "build", *pictures, "--fov-deg", FOV_DEG, "--technique", "cohog", unfinished)
     words = [sys.executable, "-m", "edgevpr", *map(str, command)]
-    subprocess.run(words, env=environment(), check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(words, env=make_environment(), check=True, stdout=subprocess.DEVNULL)
     unfinished.rename(path)
     return path
 
 
-def moved_map(place_map: Path, east_m: float, up_m: float) -> Path:
+def move_map(place_map: Path, east_m: float, up_m: float) -> Path:
     """Return a map with all of its places so far east and up; made once, beside it."""
     if not (east_m or up_m):
         return place_map
@@ -116,20 +121,20 @@ def moved_map(place_map: Path, east_m: float, up_m: float) -> Path:
         shutil.copy(place_map, unfinished)
         with PlaceMap.open_for_writing(unfinished) as places, places.transaction():
             for place in list(places.read_places()):
-                at = place.position
-                lat_deg, lon_deg = offset_position(at.lat_deg, at.lon_deg, east_m, 0.0)
-                places.move_place(place.place_id, Position(lat_deg, lon_deg, at.alt_m + up_m), place.pose)
+                position = place.position
+                lat_deg, lon_deg = offset_position(position.lat_deg, position.lon_deg, east_m, 0.0)
+                places.move_place(place.place_id, Position(lat_deg, lon_deg, position.alt_m + up_m), place.pose)
         unfinished.rename(path)
     return path
 
 
-def _mapping_poses(rng: np.random.Generator, height_m: float) -> list[CameraPose]:
+def _plan_mapping_poses(rng: np.random.Generator, height_m: float) -> list[CameraPose]:
     """Plan legs to the east and back, a picture every SPACING_M, over all of the ground."""
-    east_m = np.arange(EDGE_M, WIDTH_M - EDGE_M + 1, SPACING_M)
+    east_m = np.arange(EDGE_MARGIN_M, WIDTH_M - EDGE_MARGIN_M + 1, PICTURE_SPACING_M)
     poses = []
-    for leg, north_m in enumerate(np.arange(EDGE_M, DEPTH_M - EDGE_M + 1, SPACING_M)):
+    for leg, north_m in enumerate(np.arange(EDGE_MARGIN_M, DEPTH_M - EDGE_MARGIN_M + 1, PICTURE_SPACING_M)):
         for east in east_m if leg % 2 == 0 else east_m[::-1]:
             planned = (east, north_m, height_m, 90 if leg % 2 == 0 else 270)
-            flown = (planned + rng.normal(0, (1.0, 1.0, 0.7, 1.0))).tolist()
-            poses.append(CameraPose(**dict(zip(("east_m", "north_m", "height_m", "heading_deg"), flown, strict=True))))
+            actual = (planned + rng.normal(0, (1.0, 1.0, 0.7, 1.0))).tolist()
+            poses.append(CameraPose(**dict(zip(("east_m", "north_m", "height_m", "heading_deg"), actual, strict=True))))
     return poses

@@ -10,7 +10,8 @@ from collections.abc import Callable
 
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_value
 
-GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
+GCS_ADDRESS = (255, 190)  # system, component
+AUTOPILOT_ADDRESS = (1, 1)
 # SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2,
@@ -20,21 +21,22 @@ STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: 5,
 }
 Listener = Callable[[Message, float], None]
+Condition = Callable[[Message], bool]
 
 
 class Link:
     """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197"
-    of another component), and when it came; tells every message to the listeners, with its time. `connected` is a
-    socket; with `bytewise`, as PX4 has it, a whole number goes in a parameter's bytes."""
+    of another component) and its time of receipt; passes every message to the listeners, with its time. `connected` is
+    a socket; with `bytewise`, as in PX4, the bytes of a parameter are an integer."""
 
     def __init__(self, connected: socket.socket, listeners: list[Listener], bytewise: bool = False) -> None:
         self.last: dict[str, Message] = {}
-        self.came_s: dict[str, float] = {}
+        self.received_s: dict[str, float] = {}
         self._listeners = listeners
         self._socket, self._bytewise = connected, bytewise
-        self._mav = mavlink.MAVLink(self, *GROUND_STATION)
+        self._mav = mavlink.MAVLink(self, *GCS_ADDRESS)
         self._is_open, self._lock = True, threading.Lock()
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._beat)]
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._receive, self._send_heartbeats)]
         for thread in self._threads:
             thread.start()
 
@@ -53,14 +55,14 @@ class Link:
         with self._lock:
             self._mav.send(message)
 
-    def wait_for(self, name: str, condition: Callable[[Message], bool], patience_s: float) -> Message | None:
-        """Return the first message of a name, of those that come from now on, that fulfils a condition; None where none
-        comes in time."""
-        return self._first(name, condition, time.monotonic(), patience_s)
-
-    def _first(self, name: str, condition: Callable, since_s: float, patience_s: float) -> Message | None:
-        while time.monotonic() - since_s < patience_s:
-            if self.came_s.get(name, 0.0) >= since_s and condition(self.last[name]):
+    def wait_for(
+        self, name: str, condition: Condition, timeout_s: float, since_s: float | None = None
+    ) -> Message | None:
+        """Return the first message of a name, received after `since_s` (None: now), that fulfils a condition; None if
+        there is none in time."""
+        since_s = time.monotonic() if since_s is None else since_s
+        while time.monotonic() - since_s < timeout_s:
+            if self.received_s.get(name, 0.0) >= since_s and condition(self.last[name]):
                 return self.last[name]
             time.sleep(0.01)
         return None
@@ -69,42 +71,42 @@ class Link:
         """Send a COMMAND_LONG; return the result of its COMMAND_ACK, None where none comes."""
         seven = [*values, *[0.0] * (7 - len(values))]
         asked_s = time.monotonic()
-        self.send(mavlink.MAVLink_command_long_message(*AUTOPILOT, number, 0, *seven))
-        answer = self._first(f"COMMAND_ACK {number}", lambda _: True, asked_s, 4.0)
+        self.send(mavlink.MAVLink_command_long_message(*AUTOPILOT_ADDRESS, number, 0, *seven))
+        answer = self.wait_for(f"COMMAND_ACK {number}", lambda _: True, 4.0, asked_s)
         return answer and answer.result
 
-    def put_parameter(self, name: str, value: float) -> None:
+    def send_parameter(self, name: str, value: float) -> None:
         """Set a parameter, and do not wait: one that has changed by next to nothing is not answered."""
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         if self._bytewise and isinstance(value, int):
             kind, value = mavlink.MAV_PARAM_TYPE_INT32, struct.unpack("<f", struct.pack("<i", value))[0]
-        self.send(mavlink.MAVLink_param_set_message(*AUTOPILOT, name.encode(), float(value), kind))
+        self.send(mavlink.MAVLink_param_set_message(*AUTOPILOT_ADDRESS, name.encode(), float(value), kind))
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
 
-        def is_taken(told: Message) -> bool:
-            held = read_parameter_value(told, self._bytewise) if told.param_id == name else None
-            return held is not None and math.isclose(held, value, rel_tol=1e-5, abs_tol=1e-6)  # floats of 32 bits
+        def is_taken(message: Message) -> bool:
+            current = read_parameter_value(message, self._bytewise) if message.param_id == name else None
+            return current is not None and math.isclose(current, value, rel_tol=1e-5, abs_tol=1e-6)  # floats of 32 bits
 
         for _ in range(4):
-            self.put_parameter(name, value)
+            self.send_parameter(name, value)
             if self.wait_for("PARAM_VALUE", is_taken, 1.5):
                 return
         raise RuntimeError(f"the autopilot does not take {name} {value}")
 
-    def upload(self, items: list[Message]) -> None:
+    def upload_mission(self, items: list[Message]) -> None:
         """Upload a mission. Raises RuntimeError where the autopilot does not take it."""
         asked_s = time.monotonic()
-        self.send(mavlink.MAVLink_mission_count_message(*AUTOPILOT, len(items)))
+        self.send(mavlink.MAVLink_mission_count_message(*AUTOPILOT_ADDRESS, len(items)))
         sent_of_s: dict[str, float] = {}
         while time.monotonic() - asked_s < 20:
             for name in ("MISSION_REQUEST_INT", "MISSION_REQUEST"):
-                came_s = self.came_s.get(name, 0.0)
+                came_s = self.received_s.get(name, 0.0)
                 if came_s > sent_of_s.get(name, asked_s):
                     sent_of_s[name] = came_s
                     self.send(items[self.last[name].seq])
-            if self.came_s.get("MISSION_ACK", 0.0) >= asked_s:
+            if self.received_s.get("MISSION_ACK", 0.0) >= asked_s:
                 if self.last["MISSION_ACK"].type == mavlink.MAV_MISSION_ACCEPTED:
                     return
                 break
@@ -126,23 +128,23 @@ class Link:
             now_s = time.monotonic()
             for message in receiver.feed(data):
                 name, sender = message.get_type(), message.get_srcComponent()
-                if sender != AUTOPILOT[1]:
+                if sender != AUTOPILOT_ADDRESS[1]:
                     name = f"{name} of {sender}"
                 elif name == "COMMAND_ACK":
                     name = f"{name} {message.command}"
                 self.last[name] = message
-                self.came_s[name] = now_s  # written last: who sees the time finds the message
+                self.received_s[name] = now_s  # written last: who sees the time finds the message
                 for listener in self._listeners:
                     listener(message, now_s)
 
-    def _beat(self) -> None:
+    def _send_heartbeats(self) -> None:
         kind, autopilot = mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID
         while self._is_open:
             self.send(mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_ACTIVE, 3))
             time.sleep(0.5)
 
 
-def connected(port: int) -> socket.socket:
+def connect(port: int) -> socket.socket:
     """Return a connection to a port of this machine. Raises RuntimeError where nobody answers there."""
     give_up_s = time.monotonic() + 30
     while True:

@@ -29,9 +29,9 @@ import simulator
 from cells import CELLS, SET_UPS, Flight
 from rig import WORK
 from trial import Trial
-from verdicts import figures_of, judged, page
+from verdicts import compute_flight_figures, format_page, judge_cells
 
-KEPT = WORK / "never_worse"
+KEPT_FOLDER = WORK / "never_worse"
 _FIRST_INSTANCE = 1  # of a simulator: the first ports are left to rig.py
 
 
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("--flight", nargs=3, help=argparse.SUPPRESS)  # set-up, event, matches
     arguments = parser.parse_args()
     if arguments.flight:
-        fly(Flight(*arguments.flight))
+        fly_and_keep(Flight(*arguments.flight))
         return
     if arguments.list:
         print("\n".join(CELLS))
@@ -56,44 +56,45 @@ def main() -> None:
     names = arguments.cells or [name for name, cell in CELLS.items() if cell.is_quick or not arguments.quick]
     if not arguments.report:
         require_simulators(names)
-        fly_all(names, set(arguments.cells or ()), arguments.workers)
-    rows = kept_rows()
-    found = [row for row in judged(rows) if arguments.report or row["cell"] in names]
-    for row in found:
+        fly_cells(names, set(arguments.cells or ()), arguments.workers)
+    rows = read_kept_rows()
+    cells = [row for row in judge_cells(rows) if arguments.report or row["cell"] in names]
+    for row in cells:
         print(f"{row['cell']}: {row['verdict']}")
     if arguments.report or not (arguments.cells or arguments.quick):
-        result = {**base.made_by(), "commit": base.program_commit(ground.CHECKOUT), "cells": found}
-        base.write("never-worse", result, page(result))
-    sys.exit(not all(row["is_right"] for row in found) or len(found) < len(names))
+        result = {**base.describe_run(), "commit": base.read_program_commit(ground.CHECKOUT), "cells": cells}
+        base.write("never-worse", result, format_page(result))
+    sys.exit(not all(row["is_right"] for row in cells) or len(cells) < len(names))
 
 
 def require_simulators(names: list[str]) -> None:
     """End with a sentence where a simulator that these cells need is not built."""
     set_ups = [SET_UPS[CELLS[name].flight.set_up] for name in names]
-    if any(each.is_px4 for each in set_ups) and px4.build() is None:
+    if any(set_up.is_px4 for set_up in set_ups) and px4.find_build() is None:
         sys.exit(f"never_worse: build PX4's simulator, and name its folder in {px4.VARIABLE}.")
-    if any(simulator.tree(each.vehicle) is None for each in set_ups if not each.is_px4):
+    if any(simulator.find_build(set_up.vehicle) is None for set_up in set_ups if not set_up.is_px4):
         sys.exit(f"never_worse: build ArduPilot's simulator, and name its folder in {simulator.VARIABLE}.")
 
 
-def row_path(flight: Flight) -> Path:
+def find_row(flight: Flight) -> Path:
     """Return where the figures of a flight are kept."""
-    part = base.program_commit(ground.CHECKOUT).replace(" ", "-") if flight.has_edgevpr else "alone"
-    return KEPT / part / f"{flight.name}.json"
+    part = base.read_program_commit(ground.CHECKOUT).replace(" ", "-") if flight.has_edgevpr else "alone"
+    return KEPT_FOLDER / part / f"{flight.name}.json"
 
 
-def kept_rows() -> dict[str, base.Row]:
+def read_kept_rows() -> dict[str, base.Row]:
     """Return the figures that are kept, by the name of the flight."""
-    flights = {each.name: each for cell in CELLS.values() for each in (cell.flight, cell.control)}
-    return {name: json.loads(path.read_text()) for name, each in flights.items() if (path := row_path(each)).exists()}
+    flights = {flight.name: flight for cell in CELLS.values() for flight in (cell.flight, cell.control)}
+    paths = {name: find_row(flight) for name, flight in flights.items()}
+    return {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}
 
 
-def fly_all(names: list[str], anew: set[str], workers: int) -> None:
+def fly_cells(names: list[str], anew: set[str], workers: int) -> None:
     """Make the flights of these cells, and their controls, that are not kept, so many side by side."""
-    flights = {each.name: each for name in names for each in (CELLS[name].control, CELLS[name].flight)}
-    due = [each for name, each in flights.items() if name in anew or not row_path(each).exists()]
-    for height in {each.scenario().mapped_m for each in due}:  # made once, not by two flights at once
-        ground.place_map(WORK, 100.0, height)
+    flights = {flight.name: flight for name in names for flight in (CELLS[name].control, CELLS[name].flight)}
+    due = [flight for name, flight in flights.items() if name in anew or not find_row(flight).exists()]
+    for height in {flight.make_scenario().mapped_m for flight in due}:  # made once, not by two flights at once
+        ground.build_place_map(WORK, 100.0, height)
 
     def fly_one(flight: Flight) -> None:
         words = (flight.set_up, flight.event, flight.matches)
@@ -106,11 +107,11 @@ def fly_all(names: list[str], anew: set[str], workers: int) -> None:
 
 
 @contextmanager
-def free_instance() -> Iterator[int]:
+def reserve_instance() -> Iterator[int]:
     """Take a number of a simulator that no other sweep on this machine has; it is free again after the block."""
-    KEPT.mkdir(parents=True, exist_ok=True)
+    KEPT_FOLDER.mkdir(parents=True, exist_ok=True)
     for number in count(_FIRST_INSTANCE):
-        with open(KEPT / f"instance-{number}.lock", "w") as lock:
+        with open(KEPT_FOLDER / f"instance-{number}.lock", "w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -119,21 +120,21 @@ def free_instance() -> Iterator[int]:
             return
 
 
-def fly(flight: Flight) -> None:
+def fly_and_keep(flight: Flight) -> None:
     """Make one flight, and keep its figures; a control that another sweep is flying is waited for."""
-    path = row_path(flight)
+    path = find_row(flight)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path.with_suffix(".lock"), "w") as lock, free_instance() as instance:
+    with open(path.with_suffix(".lock"), "w") as lock, reserve_instance() as instance:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if path.exists() and not flight.has_edgevpr:
             return
         folder = Trial(WORK, path.with_suffix(""), flight, instance).fly()
-        row = figures_of(folder, flight)
+        row = compute_flight_figures(folder, flight)
     unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(base.rounded(row)))
+    unfinished.write_text(json.dumps(base.round_floats(row)))
     unfinished.replace(path)
-    shown = {key: value for key, value in base.rounded(row).items() if key not in ("commit", "texts")}
-    print(f"{flight.name}: {json.dumps(shown)}", flush=True)
+    figures = {key: value for key, value in base.round_floats(row).items() if key not in ("commit", "texts")}
+    print(f"{flight.name}: {json.dumps(figures)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -8,14 +8,15 @@ from pathlib import Path
 from link import Link, Listener
 from relay import DatagramRelay
 from scenarios import COPTER_CIRCUIT_M, COPTER_HOME_M, COPTER_SPEED_M_S, HOME_M
-from simulator import Process, at_degrees
+from simulator import Process, make_mission_items, to_degrees
 from truth import Truth
 
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_PX4"
 # Of the first instance, 1 more for each next one: where PX4 listens for us; where it sends to and listens for edgevpr.
-_OWN_PORT, _COMPANION_PORTS = 18570, (14540, 14580)
+_GCS_PORT = 18570
+_COMPANION_PORTS = (14540, 14580)
 GROUND_ALT_M = 1.0  # of the simulated ground: a plane's height control begins at an altitude of 0 and ramps from there
 # What an aircraft of the simulator needs to fly a mission that nobody holds a transmitter for, and that ends nowhere.
 PARAMETERS = {
@@ -28,11 +29,12 @@ PARAMETERS = {
     "SDLOG_MODE": -1,
 }
 # The airframe of 1.18 sets the thrust by a name that its simulator no longer reads: at 2 N it never leaves the ground.
-_OF_VEHICLE = {"plane": {"SIH_F_T_MAX": 6.0, "SIH_F_Q_MAX": 0.03}, "copter": {}}
+_VEHICLE_PARAMETERS = {"plane": {"SIH_F_T_MAX": 6.0, "SIH_F_Q_MAX": 0.03}, "copter": {}}
 _MODELS = {"plane": "sihsim_airplane", "copter": "sihsim_quadx"}
-_AUTO, _MISSION = 4, 4
-MODES = {f"AUTO.{name}": _AUTO << 16 | number << 24 for name, number in (("MISSION", 4), ("RTL", 5), ("LAND", 6))}
-MODES |= {"AUTO.LOITER": _AUTO << 16 | 3 << 24, "DESCEND": 4 << 16 | 10 << 24}
+_AUTO_MODE = 4
+_MISSION_MODE = 4  # of AUTO
+MODES = {f"AUTO.{name}": _AUTO_MODE << 16 | number << 24 for name, number in (("MISSION", 4), ("RTL", 5), ("LAND", 6))}
+MODES |= {"AUTO.LOITER": _AUTO_MODE << 16 | 3 << 24, "DESCEND": 4 << 16 | 10 << 24}
 _STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 50,
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
@@ -42,7 +44,7 @@ _STREAMS_HZ = {
 _CIRCUIT_M = ((340.0, 730.0), (1060.0, 730.0), (1060.0, 260.0), (340.0, 260.0))
 
 
-def build() -> Path | None:
+def find_build() -> Path | None:
     """Return the folder of the PX4 build that EDGEVPR_PX4 names, None where none is there."""
     folder = Path(os.environ.get(VARIABLE, ""))
     return folder.resolve() if (folder / "bin/px4").exists() else None
@@ -65,22 +67,22 @@ class Px4(Process):
     ) -> None:
         super().__init__(folder, listeners)
         self._vehicle, self._instance = vehicle, instance
-        lat_deg, lon_deg = at_degrees(*home_m)
+        lat_deg, lon_deg = to_degrees(*home_m)
         home = {"PX4_HOME_LAT": f"{lat_deg:.7f}", "PX4_HOME_LON": f"{lon_deg:.7f}", "PX4_HOME_ALT": str(GROUND_ALT_M)}
         model = {"PX4_SIMULATOR": "sihsim", "PX4_SIM_MODEL": _MODELS[vehicle], "HEADLESS": "1"}
-        parameters = PARAMETERS | _OF_VEHICLE[vehicle] | parameters | {"MAV_SYS_ID": 1}
-        own = {f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()}
-        self._environment = {**os.environ, **home, **model, **own}
+        parameters = PARAMETERS | _VEHICLE_PARAMETERS[vehicle] | parameters | {"MAV_SYS_ID": 1}
+        variables = {f"PX4_PARAM_{name}": str(value) for name, value in parameters.items()}
+        self._environment = {**os.environ, **home, **model, **variables}
 
     def start(self, *, wipe: bool) -> None:
-        self._launch(
-            [build() / "bin/px4", "-i", self._instance, "-d", build() / "etc", "-w", self._folder], self._environment
-        )
+        build = find_build()
+        command = [build / "bin/px4", "-i", self._instance, "-d", build / "etc", "-w", self._folder]
+        self._launch(command, self._environment)
         station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        station.connect(("127.0.0.1", _OWN_PORT + self._instance))
-        self._talk(Link(station, self._listeners, bytewise=True), _STREAMS_HZ)
+        station.connect(("127.0.0.1", _GCS_PORT + self._instance))
+        self._connect(Link(station, self._listeners, bytewise=True), _STREAMS_HZ)
 
-    def relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> DatagramRelay:
+    def make_relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> DatagramRelay:
         """Make the wire to edgevpr."""
         return DatagramRelay(truth, log, tuple(port + self._instance for port in _COMPANION_PORTS), origin_m)
 
@@ -88,15 +90,16 @@ class Px4(Process):
         """Start a mission (None: round and round a circuit), and wait until the aircraft is at that height. Raises
         RuntimeError where it never is."""
         self.wait_ready()
-        self.link.upload(items or _mission(self._vehicle, height_m))
-        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, _AUTO, _MISSION)
+        self.link.upload_mission(items or _make_mission(self._vehicle, height_m))
+        flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        self.link.command(mavlink.MAV_CMD_DO_SET_MODE, flag, _AUTO_MODE, _MISSION_MODE)
         for _ in range(30):
             if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
                 break
             time.sleep(1)
         else:
             raise RuntimeError("PX4 does not arm")
-        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda told: told.relative_alt > 950 * height_m, 180):
+        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 950 * height_m, 180):
             raise RuntimeError(f"{height_m:.0f} m are not reached")
 
     def set_gps(self, is_on: bool) -> None:
@@ -107,7 +110,7 @@ class Px4(Process):
 
     def displace_gps(self, north_m: float) -> None:
         """Let the receiver's positions lie so far north of the truth. README.md says what this takes."""
-        self.link.put_parameter("SIM_GPS_OFF_N", float(north_m))
+        self.link.send_parameter("SIM_GPS_OFF_N", float(north_m))
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
         if from_deg != 270.0:
@@ -126,7 +129,7 @@ class Px4(Process):
         raise RuntimeError("PX4 is never ready")
 
 
-def _mission(vehicle: str, height_m: float) -> list[Message]:
+def _make_mission(vehicle: str, height_m: float) -> list[Message]:
     """Make the mission: take off, then round and round the corners of a circuit, (east, north) each."""
     takeoff, waypoint, jump = mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_DO_JUMP
     free = (0, 0, 0, float("nan"))
@@ -139,15 +142,4 @@ def _mission(vehicle: str, height_m: float) -> list[Message]:
         rows += [(mavlink.MAV_CMD_DO_CHANGE_SPEED, (1, COPTER_SPEED_M_S, -1, 0), None, 0)]
         rows += [(waypoint, free, corner_m, height_m) for corner_m in COPTER_CIRCUIT_M]
         rows += [(jump, (2, -1, 0, 0), None, 0)]
-    return mission_items(rows)
-
-
-def mission_items(rows) -> list[Message]:
-    """Make the items of a mission from (command, its four values, place or None, height) each."""
-    items = []
-    for number, (command, values, at_m, up_m) in enumerate(rows):
-        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m)) if at_m else (0, 0)
-        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if at_m else mavlink.MAV_FRAME_MISSION
-        own = (number, frame, command, int(number == 0), 1, *values, lat, lon, up_m)
-        items.append(mavlink.MAVLink_mission_item_int_message(1, 1, *own))
-    return items
+    return make_mission_items(rows)

@@ -31,7 +31,7 @@ class Recorder:
             self.is_on = False
             self._file.close()
 
-    def listen(self, message: Message, now_s: float) -> None:
+    def handle_message(self, message: Message, now_s: float) -> None:
         """Take note of a message."""
         name, sender = message.get_type(), message.get_srcComponent()
         if name == "STATUSTEXT":
@@ -40,10 +40,10 @@ class Recorder:
                 self.warnings.append(message.text.removeprefix("edgevpr: "))
         elif name == "HEARTBEAT" and sender == 1:
             self._mode = message.custom_mode
-        elif name == "GLOBAL_POSITION_INT" and sender == 1 and (true := self._truth.at(now_s)):
+        elif name == "GLOBAL_POSITION_INT" and sender == 1 and (true := self._truth.compute_pose(now_s)):
             east_m, north_m = to_metres(message.lat / 1e7, message.lon / 1e7)
             error_m = math.hypot(east_m - true.east_m, north_m - true.north_m)
-            where = ",".join(f"{each:.2f}" for each in (true.east_m, true.north_m, east_m, north_m, error_m))
+            values = ",".join(f"{value:.2f}" for value in (true.east_m, true.north_m, east_m, north_m, error_m))
             with self._lock:
                 if self.is_on:
-                    self._file.write(f"{now_s:.3f},{where},{self._mode},{true.height_m:.2f}\n")
+                    self._file.write(f"{now_s:.3f},{values},{self._mode},{true.height_m:.2f}\n")

@@ -14,9 +14,9 @@ from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 COLUMNS = ("t_s", "kind", "age_s", "east_m", "north_m", "accuracy_m", "true_east_m", "true_north_m")
-_TURN_S = 0.2
+_POLL_S = 0.2
 _SLOW_BUFFER_BYTES = 4096  # of a slow wire: what does not fit is lost, not late
-Sent = tuple[float, float, float, float]  # age in seconds, east and north in metres, accuracy in metres
+SentPosition = tuple[float, float, float, float]  # age in seconds, east and north in metres, accuracy in metres
 
 
 class Relay:
@@ -31,8 +31,8 @@ class Relay:
         self._log.write(",".join(COLUMNS) + "\n")
         self.drops: Callable[[Message], bool] = lambda message: False
         self._reader, self._bytes_per_s = PacketReader(), math.inf
-        self._near: socket.socket | None = None
-        self._far: socket.socket | None = None
+        self._edgevpr_socket: socket.socket | None = None
+        self._autopilot_socket: socket.socket | None = None
         self._is_open = True
         self.uri = self._listen()
         self._threads = [threading.Thread(target=work) for work in (self._serve_edgevpr, self._serve_autopilot)]
@@ -49,41 +49,41 @@ class Relay:
         self._server.close()
         self._log.close()
 
-    def inject(self, data: bytes, is_heard: bool = False) -> None:
-        """Send to the autopilot; `is_heard`: to edgevpr as well, as a router does with messages that have no target."""
-        self._send(self._far, data)
-        if is_heard:
-            self._send(self._near, data)
+    def inject(self, data: bytes, to_edgevpr: bool = False) -> None:
+        """Send to the autopilot, and `to_edgevpr` as well, as a router does with messages that have no target."""
+        self._send(self._autopilot_socket, data)
+        if to_edgevpr:
+            self._send(self._edgevpr_socket, data)
 
     def saturate(self, bytes_per_s: float) -> None:
         """Carry no more than that from now on, either way, and lose what is sent beyond it."""
         self._bytes_per_s = bytes_per_s
-        for end in filter(None, (self._near, self._far)):
+        for end in filter(None, (self._edgevpr_socket, self._autopilot_socket)):
             end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SLOW_BUFFER_BYTES)
 
     def _listen(self) -> str:
         self._server = socket.create_server(("127.0.0.1", 0))
-        self._server.settimeout(_TURN_S)
+        self._server.settimeout(_POLL_S)
         return f"tcp:127.0.0.1:{self._server.getsockname()[1]}"
 
     def _serve_edgevpr(self) -> None:
         while self._is_open:
             with contextlib.suppress(OSError):  # nobody comes
-                self._near, _ = self._server.accept()
-                with self._near:
-                    self._carry(self._near, self._to_autopilot)
+                self._edgevpr_socket, _ = self._server.accept()
+                with self._edgevpr_socket:
+                    self._forward_data(self._edgevpr_socket, self._forward_to_autopilot)
 
     def _serve_autopilot(self) -> None:
         while self._is_open:
             with contextlib.suppress(OSError):  # it has no power
-                self._far = socket.create_connection(("127.0.0.1", self._autopilot_port), 1)
-                with self._far:
-                    self._carry(self._far, lambda data: self._send(self._near, data))
-            time.sleep(_TURN_S)
+                self._autopilot_socket = socket.create_connection(("127.0.0.1", self._autopilot_port), 1)
+                with self._autopilot_socket:
+                    self._forward_data(self._autopilot_socket, lambda data: self._send(self._edgevpr_socket, data))
+            time.sleep(_POLL_S)
 
-    def _carry(self, source: socket.socket, deliver: Callable[[bytes], object]) -> None:
+    def _forward_data(self, source: socket.socket, deliver: Callable[[bytes], object]) -> None:
         """Deliver what comes from a source until it has gone."""
-        source.settimeout(_TURN_S)
+        source.settimeout(_POLL_S)
         if source.type == socket.SOCK_STREAM:
             source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while self._is_open:
@@ -96,24 +96,24 @@ class Relay:
             time.sleep(len(data) / self._bytes_per_s)
             deliver(data)
 
-    def _to_autopilot(self, data: bytes) -> None:
+    def _forward_to_autopilot(self, data: bytes) -> None:
         for message in self._reader.feed(data):
             if not self.drops(message):
                 self.inject(bytes(message.get_msgbuf()))
-            self._note(message, time.monotonic())
+            self._log_position(message, time.monotonic())
 
     def _send(self, sink: socket.socket | None, data: bytes) -> None:
         with contextlib.suppress(OSError, AttributeError):  # nobody is there
             sink.sendall(data)
 
-    def _note(self, message: Message, now_s: float) -> None:
-        sent = _sent(message, self._origin_m)
+    def _log_position(self, message: Message, now_s: float) -> None:
+        sent = _read_position(message, self._origin_m)
         if sent is None:
             return
-        true = self._truth.at(now_s - sent[0])
+        true = self._truth.compute_pose(now_s - sent[0])
         if true is not None:
             figures = (*sent, true.east_m, true.north_m)
-            self._log.write(f"{now_s:.4f},{message.get_type()}," + ",".join(f"{each:.3f}" for each in figures) + "\n")
+            self._log.write(f"{now_s:.4f},{message.get_type()}," + ",".join(f"{value:.3f}" for value in figures) + "\n")
 
 
 class DatagramRelay(Relay):
@@ -121,26 +121,26 @@ class DatagramRelay(Relay):
 
     def __init__(self, truth: Truth, log: Path, ports: tuple[int, int], origin_m: tuple[float, float]) -> None:
         super().__init__(truth, log, ports[1], origin_m)
-        self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._far.bind(("127.0.0.1", ports[0]))
-        self._far.connect(("127.0.0.1", ports[1]))
+        self._autopilot_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._autopilot_socket.bind(("127.0.0.1", ports[0]))
+        self._autopilot_socket.connect(("127.0.0.1", ports[1]))
 
     def _listen(self) -> str:
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
-        self._near = self._server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._near.connect(("127.0.0.1", port))
+        self._edgevpr_socket = self._server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._edgevpr_socket.connect(("127.0.0.1", port))
         return f"udpin:127.0.0.1:{port}"
 
     def _serve_edgevpr(self) -> None:
-        self._carry(self._near, self._to_autopilot)
+        self._forward_data(self._edgevpr_socket, self._forward_to_autopilot)
 
     def _serve_autopilot(self) -> None:
-        with self._far:
-            self._carry(self._far, lambda data: self._send(self._near, data))
+        with self._autopilot_socket:
+            self._forward_data(self._autopilot_socket, lambda data: self._send(self._edgevpr_socket, data))
 
 
-def _sent(message: Message, origin_m: tuple[float, float]) -> Sent | None:
+def _read_position(message: Message, origin_m: tuple[float, float]) -> SentPosition | None:
     """Return what a message says of the position: its age, the position, and the 1-sigma accuracy of an axis; None
     where it says nothing."""
     kind = message.get_type()
@@ -151,9 +151,9 @@ def _sent(message: Message, origin_m: tuple[float, float]) -> Sent | None:
     if kind == "GPS_INPUT" and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
         return 0.0, *to_metres(message.lat / 1e7, message.lon / 1e7), message.horiz_accuracy
     if kind == "ODOMETRY":
-        of_axes = [message.pose_covariance[each] for each in (0, 6)]
-        accuracy_m = max(of_axes) ** 0.5
+        variances_m2 = [message.pose_covariance[number] for number in (0, 6)]
+        accuracy_m = max(variances_m2) ** 0.5
         if message.frame_id == mavlink.MAV_FRAME_LOCAL_FRD:  # as ArduPilot reads it (see messages.odometry)
-            accuracy_m = sum(each**2 for each in of_axes) ** (1 / 3)
+            accuracy_m = sum(number**2 for number in variances_m2) ** (1 / 3)
         return 0.0, origin_m[0] + message.y, origin_m[1] + message.x, accuracy_m
     return None

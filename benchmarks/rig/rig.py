@@ -17,11 +17,11 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import base
 import ground
 import px4
-from figures import figures_of
+from figures import compute_run_figures
 from flying import Run
 from page import draw_claims, write_page
-from scenarios import HEIGHT_M, SCENARIOS, numbered
-from simulator import VARIABLE, tree
+from scenarios import HEIGHT_M, SCENARIOS, format_flight_name
+from simulator import VARIABLE, find_build
 
 WORK = Path.home() / ".cache" / "edgevpr-rig"
 
@@ -47,25 +47,25 @@ def main() -> None:
     if absent := [str(path) for path in (arguments.ground, arguments.later) if path and not path.exists()]:
         parser.error(f"{absent[0]} is not there")
     height_m = arguments.height or HEIGHT_M
-    work = ground.from_rasters(WORK, arguments.ground, arguments.later, height_m) if arguments.ground else WORK
-    flown = []
+    work = ground.make_raster_ground(WORK, arguments.ground, arguments.later, height_m) if arguments.ground else WORK
+    folders = []
     if not arguments.report:
         for name in arguments.scenarios or SCENARIOS:
             scenario = SCENARIOS[name]
-            if (px4.build if scenario.is_px4 else tree)() is None:
+            if (px4.find_build if scenario.is_px4 else find_build)() is None:
                 whose, variable = ("PX4", px4.VARIABLE) if scenario.is_px4 else ("ArduPilot", VARIABLE)
                 sys.exit(f"rig: build {whose}'s simulator, and name its folder in {variable}.")
-            shown = replace(scenario, off_s=arguments.seconds or scenario.off_s, height_m=height_m)
-            flights = [(numbered(name, seed), False) for seed in range(1, 1 + arguments.seeds)]
+            changed = replace(scenario, off_s=arguments.seconds or scenario.off_s, height_m=height_m)
+            flights = [(format_flight_name(name, seed), False) for seed in range(1, 1 + arguments.seeds)]
             for flight, is_control in [*flights, (name, True)][: arguments.seeds + scenario.is_compared]:
                 try:
-                    folder = Run(work, work / "runs" / f"{flight}{'-control' * is_control}", shown, is_control).fly()
-                    print(f"{folder.name}: {json.dumps(figures_of(folder))}", flush=True)
-                    flown += [] if is_control else [folder]
+                    folder = Run(work, work / "runs" / f"{flight}{'-control' * is_control}", changed, is_control).fly()
+                    print(f"{folder.name}: {json.dumps(compute_run_figures(folder))}", flush=True)
+                    folders += [] if is_control else [folder]
                 except RuntimeError as error:  # one that does not arm, for example: the page has the others
                     print(f"rig: {flight}: {error}", file=sys.stderr, flush=True)
-    if flown:
-        draw_claims(flown, work / "claims.jpg")
+    if folders:
+        draw_claims(folders, work / "claims.jpg")
     if arguments.report or not (arguments.scenarios or arguments.ground):
         write_page(WORK)
 

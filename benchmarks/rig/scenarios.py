@@ -7,7 +7,9 @@ from typing import Any
 from edgevpr.frames.level import STRAIGHT_DOWN, Mount
 
 HEIGHT_M = 100.0
-HOME_M, CLIMB_M = (240.0, 200.0), (560.0, 230.0)  # metres east and north on the ground
+# Metres east and north on the ground.
+HOME_M = (240.0, 200.0)
+CLIMB_M = (560.0, 230.0)
 CIRCUIT_M = ((1060.0, 260.0), (1060.0, 730.0), (340.0, 730.0), (340.0, 260.0))
 COPTER_HOME_M = (420.0, 320.0)
 COPTER_CIRCUIT_M = ((980.0, 320.0), (980.0, 680.0), (420.0, 680.0), (420.0, 320.0))
@@ -53,13 +55,13 @@ class Scenario:
     is_compared: bool = True
 
 
-def numbered(name: str, seed: int) -> str:
+def format_flight_name(name: str, seed: int) -> str:
     """Return the name of a scenario's flight of a seed: "plane_wind", "plane_wind.2"."""
     return name if seed == 1 else f"{name}.{seed}"
 
 
-def scenario_of(flight: str) -> tuple[str, int]:
-    """Return the name of the scenario of a flight, and its seed; the inverse of `numbered`."""
+def parse_flight_name(flight: str) -> tuple[str, int]:
+    """Return the name of the scenario of a flight, and its seed; the inverse of `format_flight_name`."""
     name, _, seed = flight.partition(".")
     return name, int(seed or 1)
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground import GROUND_ALT_M
-from link import STREAMS_HZ, Link, Listener, connected
+from link import STREAMS_HZ, Link, Listener, connect
 from relay import Relay
+from scenarios import CIRCUIT_M, CLIMB_M, HOME_M
 from truth import Truth
 
 from edgevpr.lab.simulate.camera import CameraPose
@@ -41,16 +42,16 @@ VEHICLES = {
 }
 
 
-def tree(vehicle: str = "plane") -> Path | None:
+def find_build(vehicle: str = "plane") -> Path | None:
     """Return the folder of ArduPilot that EDGEVPR_ARDUPILOT names, None where that vehicle has not been built there."""
     folder = Path(os.environ.get(VARIABLE, ""))
     return folder.resolve() if (folder / "build/sitl/bin" / VEHICLES[vehicle].binary).exists() else None
 
 
-def at_degrees(east_m: float, north_m: float) -> tuple[float, float]:
+def to_degrees(east_m: float, north_m: float) -> tuple[float, float]:
     """Return latitude and longitude of a point of the ground."""
-    where = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
-    return where.lat_deg, where.lon_deg
+    position = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
+    return position.lat_deg, position.lon_deg
 
 
 class Process:
@@ -79,13 +80,13 @@ class Process:
         raise NotImplementedError
 
     def _launch(self, command: list, environment: dict[str, str]) -> None:
-        with open(self._folder / "simulator.txt", "ab") as said:
-            streams = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said}
+        with open(self._folder / "simulator.txt", "ab") as output:
+            streams = {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
             self._process = subprocess.Popen(
                 [*map(str, command)], cwd=self._folder, env=environment, start_new_session=True, **streams
             )
 
-    def _talk(self, link: Link, streams_hz: dict[int, float]) -> None:
+    def _connect(self, link: Link, streams_hz: dict[int, float]) -> None:
         """Keep the link, and ask for messages at these rates."""
         self.link = link
         if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
@@ -124,7 +125,7 @@ class Simulator(Process):
         self._name, self._instance = vehicle, instance
         self._ports = [port + 10 * instance for port in _PORTS]
         self._parameters = parameters
-        self._home = "{:.7f},{:.7f},{:.0f},90".format(*at_degrees(*home_m), GROUND_ALT_M)
+        self._home = "{:.7f},{:.7f},{:.0f},90".format(*to_degrees(*home_m), GROUND_ALT_M)
 
     def __enter__(self) -> "Simulator":
         try:
@@ -134,17 +135,17 @@ class Simulator(Process):
         return super().__enter__()
 
     def start(self, *, wipe: bool) -> None:
-        own = self._folder / "rig.parm"
-        own.write_text("".join(f"{name} {value}\n" for name, value in self._parameters.items()))
-        folder = tree(self._name)
+        parameter_file = self._folder / "rig.parm"
+        parameter_file.write_text("".join(f"{name} {value}\n" for name, value in self._parameters.items()))
+        folder = find_build(self._name)
         defaults = folder / "Tools/autotest" / self.vehicle.defaults
         command = [folder / "build/sitl/bin" / self.vehicle.binary, "--model", self.vehicle.model, "--speedup", "1"]
         command += ["--home", self._home, "--sim-address", "127.0.0.1", f"-I{self._instance}"]
-        command += ["--defaults", f"{defaults},{own}", *(["--wipe"] if wipe else [])]
+        command += ["--defaults", f"{defaults},{parameter_file}", *(["--wipe"] if wipe else [])]
         self._launch(command, dict(os.environ))
-        self._talk(Link(connected(self._ports[0]), self._listeners), STREAMS_HZ)
+        self._connect(Link(connect(self._ports[0]), self._listeners), STREAMS_HZ)
 
-    def relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> Relay:
+    def make_relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> Relay:
         """Make the wire to edgevpr."""
         return Relay(truth, log, self._ports[1], origin_m)
 
@@ -176,7 +177,7 @@ class Simulator(Process):
 
     def wait_height(self, height_m: float) -> None:
         """Wait until the aircraft is that high. Raises RuntimeError where it does not climb."""
-        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda told: told.relative_alt > 1000 * height_m, 180):
+        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 1000 * height_m, 180):
             raise RuntimeError(f"{height_m:.0f} m are not reached")
 
     def set_gps(self, is_on: bool) -> None:
@@ -187,24 +188,29 @@ class Simulator(Process):
 
     def displace_gps(self, north_m: float) -> None:
         """Let the receiver's positions lie so far north of the truth."""
-        north_deg = at_degrees(0.0, north_m)[0] - at_degrees(0.0, 0.0)[0]
-        self.link.put_parameter("SIM_GPS1_GLTCH_X", north_deg)
+        north_deg = to_degrees(0.0, north_m)[0] - to_degrees(0.0, 0.0)[0]
+        self.link.send_parameter("SIM_GPS1_GLTCH_X", north_deg)
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
         self.link.set_parameter("SIM_WIND_DIR", from_deg)
         self.link.set_parameter("SIM_WIND_SPD", speed_m_s)
 
 
-def mission(home_m: tuple[float, float], climb_m: tuple[float, float], circuit_m, height_m: float) -> list[Message]:
+def make_mission(height_m: float) -> list[Message]:
     """Make the mission of a plane: take off, then round and round the corners of a circuit, (east, north) each."""
     takeoff, waypoint, jump = mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_DO_JUMP
-    rows = [(waypoint, 0, home_m, 0.0), (takeoff, 12, climb_m, 0.6 * height_m)]
-    rows += [(waypoint, 0, corner_m, height_m) for corner_m in circuit_m]
-    rows += [(jump, 2, None, -1)]
+    free = (0, 0, 0, 0)
+    rows = [(waypoint, free, HOME_M, 0.0), (takeoff, (12, 0, 0, 0), CLIMB_M, 0.6 * height_m)]
+    rows += [(waypoint, free, corner_m, height_m) for corner_m in CIRCUIT_M]
+    return make_mission_items([*rows, (jump, (2, -1, 0, 0), None, 0)])
+
+
+def make_mission_items(rows) -> list[Message]:
+    """Make the items of a mission from (command, its four values, place or None, height) each."""
     items = []
-    for number, (command, first, at_m, height) in enumerate(rows):
-        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m)) if at_m else (0, 0)
-        second, up_m = (height, 0.0) if command == jump else (0.0, height)
-        values = (mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, command, 0, 1, first, second, 0.0, 0.0, lat, lon, up_m)
-        items.append(mavlink.MAVLink_mission_item_int_message(1, 1, number, *values))
+    for number, (command, values, at_m, up_m) in enumerate(rows):
+        lat, lon = (round(1e7 * degrees) for degrees in to_degrees(*at_m)) if at_m else (0, 0)
+        frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT if at_m else mavlink.MAV_FRAME_MISSION
+        fields = (number, frame, command, int(number == 0), 1, *values, lat, lon, up_m)
+        items.append(mavlink.MAVLink_mission_item_int_message(1, 1, *fields))
     return items

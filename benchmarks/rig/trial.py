@@ -11,20 +11,21 @@ from pathlib import Path
 
 import base
 import ground
-from cells import CENTRE_M, EVENTS, HEIGHT_M, LEG_M, RADIUS_M, SET_UPS, WATCHED_S, Flight
-from flying import Run
-from px4 import mission_items
+from cells import CENTRE_M, EVENTS, LEG_M, RADIUS_M, SET_UPS, WATCH_S, Flight
+from flying import LOOP_STEP_S, Run
 from recording import EDGEVPR
-from simulator import at_degrees
+from scenarios import HEIGHT_M
+from simulator import make_mission_items, to_degrees
 
 from edgevpr.mavlink.wire import mavlink
 
-_STEP_S, _SETTLED_S, _OFF_S = 0.1, 10.0, 6.0
-_ASKED_S = 10.0  # after which edgevpr has asked for all parameters
-_SAVED_S = 3.0  # after which a parameter that was set outlives a loss of power
-_CIRCLE_S = 40.0  # until a plane is on its circle, at the most
-_POINTS = 72  # of a circle
-_PAUSE = 1  # edgevpr's wish, first parameter of MAV_CMD_USER_1
+_SETTLE_S = 10.0
+_POWER_OFF_S = 6.0
+_PARAMETER_REQUESTS_S = 10.0  # after which edgevpr has asked for all parameters
+_PARAMETER_SAVE_S = 3.0  # after which a parameter that was set outlives a loss of power
+_CIRCLE_ENTRY_S = 40.0  # until a plane is on its circle, at the most
+_CIRCLE_POINTS = 72  # of a circle
+_PAUSE_REQUEST = 1  # edgevpr's wish, first parameter of MAV_CMD_USER_1
 
 
 class Trial(Run):
@@ -32,9 +33,9 @@ class Trial(Run):
     flight without edgevpr."""
 
     def __init__(self, work: Path, folder: Path, flight: Flight, instance: int) -> None:
-        super().__init__(work, folder, flight.scenario(), not flight.has_edgevpr, instance)
+        super().__init__(work, folder, flight.make_scenario(), not flight.has_edgevpr, instance)
         self._flight, self._event = flight, EVENTS[flight.event]
-        self._each_turn: dict[str, Callable[[float], object]] = {}
+        self._repeated_actions: dict[str, Callable[[float], object]] = {}
 
     def fly(self) -> Path:
         """Fly it. What cannot be flown is said in run.json."""
@@ -45,18 +46,18 @@ class Trial(Run):
                 self._recorder.is_on = True
                 self._start_edgevpr()
                 for action, values in self._event.before:
-                    self._act(action, values)
+                    self._run_action(action, values)
                 self._marks_s["started"] = time.monotonic()
                 self._simulator.wait_ready()
                 self._take_off()
-                self._settle()
-                self._watch(WATCHED_S)
-                self._pose()  # a simulator that has not lasted until here has flown nothing
+                self._wait_settled()
+                self._watch(WATCH_S)
+                self._wait_pose()  # a simulator that has not lasted until here has flown nothing
             except RuntimeError as error:
                 cannot = str(error)
             self._recorder.is_on = False
         run = {
-            "commit": base.program_commit(ground.CHECKOUT),
+            "commit": base.read_program_commit(ground.CHECKOUT),
             "cannot": cannot,
             "marks_s": self._marks_s,
             "path_m": getattr(self, "_path_m", None),
@@ -75,7 +76,7 @@ class Trial(Run):
                 east_m, north_m = self._scenario.home_m
                 circle = (mavlink.MAV_CMD_NAV_LOITER_UNLIM, (0, 0, RADIUS_M, math.nan), CENTRE_M, HEIGHT_M)
                 rows = [(*rows[0][:2], (east_m, north_m + 320), 0.6 * HEIGHT_M), circle]
-            simulator.take_off(HEIGHT_M, mission_items(rows))
+            simulator.take_off(HEIGHT_M, make_mission_items(rows))
         elif is_plane:
             simulator.arm("TAKEOFF")
             simulator.wait_height(50.0)
@@ -87,33 +88,34 @@ class Trial(Run):
             simulator.link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT_M)
             simulator.wait_height(HEIGHT_M - 1.0)
 
-    def _settle(self) -> None:
+    def _wait_settled(self) -> None:
         """Wait until the aircraft is where it is to be watched, and note the path that it should keep to."""
-        give_up_s = time.monotonic() + _CIRCLE_S
+        give_up_s = time.monotonic() + _CIRCLE_ENTRY_S
         is_plane = self._scenario.vehicle == "plane"
-        while is_plane and time.monotonic() < give_up_s and abs(self._from_centre_m() - RADIUS_M) > 40.0:
-            time.sleep(_STEP_S)
-        time.sleep(_SETTLED_S)
+        while is_plane and time.monotonic() < give_up_s and abs(self._measure_radius_m() - RADIUS_M) > 40.0:
+            time.sleep(LOOP_STEP_S)
+        time.sleep(_SETTLE_S)
         if is_plane:
-            radius_m = self._from_centre_m()
-            turns = [2 * math.pi * number / _POINTS for number in range(_POINTS + 1)]
+            radius_m = self._measure_radius_m()
+            turns = [2 * math.pi * number / _CIRCLE_POINTS for number in range(_CIRCLE_POINTS + 1)]
             self._path_m = [
                 (CENTRE_M[0] + radius_m * math.cos(turn), CENTRE_M[1] + radius_m * math.sin(turn)) for turn in turns
             ]
         else:
-            at = self._pose()
-            self._path_m = [(at.east_m, at.north_m), LEG_M[1] if self._event.leaves_map else (at.east_m, at.north_m)]
+            pose = self._wait_pose()
+            start_m = pose.east_m, pose.north_m
+            self._path_m = [start_m, LEG_M[1] if self._event.leaves_map else start_m]
 
-    def _pose(self):
+    def _wait_pose(self):
         for _ in range(50):
-            if at := self._truth.at(time.monotonic()):
-                return at
-            time.sleep(_STEP_S)
+            if pose := self._truth.compute_pose(time.monotonic()):
+                return pose
+            time.sleep(LOOP_STEP_S)
         raise RuntimeError("the simulator has stopped")
 
-    def _from_centre_m(self) -> float:
-        at = self._pose()
-        return math.hypot(at.east_m - CENTRE_M[0], at.north_m - CENTRE_M[1])
+    def _measure_radius_m(self) -> float:
+        pose = self._wait_pose()
+        return math.hypot(pose.east_m - CENTRE_M[0], pose.north_m - CENTRE_M[1])
 
     def _watch(self, seconds: float) -> None:
         began_s = self._marks_s["event"] = time.monotonic()
@@ -123,13 +125,13 @@ class Trial(Run):
         while (now_s := time.monotonic()) < began_s + seconds:
             while steps and now_s >= began_s + steps[0].at_s:
                 step = steps.pop(0)
-                self._act(step.action, step.values)
-            for act in list(self._each_turn.values()):
+                self._run_action(step.action, step.values)
+            for act in list(self._repeated_actions.values()):
                 act(now_s)
-            time.sleep(_STEP_S)
+            time.sleep(LOOP_STEP_S)
 
     def _go_to(self, at_m: tuple[float, float]) -> None:
-        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(*at_m))
+        lat, lon = (round(1e7 * degrees) for degrees in to_degrees(*at_m))
         values = (0, 0, -1, 1, RADIUS_M if self._scenario.vehicle == "plane" else 0, math.nan, lat, lon)
         up_m, frame = HEIGHT_M, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
         if self._scenario.is_px4:  # which knows this command by altitude only
@@ -141,11 +143,11 @@ class Trial(Run):
         """Wait until edgevpr has begun, and has had the time to ask for parameters."""
         if not self._is_control and not self._simulator.link.wait_for(f"HEARTBEAT of {EDGEVPR}", lambda _: True, 60):
             raise RuntimeError("edgevpr does not begin")
-        time.sleep(_ASKED_S)
+        time.sleep(_PARAMETER_REQUESTS_S)
 
-    def _act(self, action: str, values: tuple[float, ...]) -> None:
+    def _run_action(self, action: str, values: tuple[float, ...]) -> None:
         self._marks_s.setdefault(action, time.monotonic())
-        if action not in _OF_EDGEVPR or not self._is_control:
+        if action not in _EDGEVPR_ACTIONS or not self._is_control:
             getattr(self, action)(*values)
 
     # What happens to the autopilot and its receiver
@@ -161,7 +163,7 @@ class Trial(Run):
 
     def drift_gps(self, speed_m_s: float) -> None:
         began_s = time.monotonic()
-        self._each_turn["drift"] = lambda now_s: self._simulator.displace_gps(speed_m_s * (now_s - began_s))
+        self._repeated_actions["drift"] = lambda now_s: self._simulator.displace_gps(speed_m_s * (now_s - began_s))
 
     def flag_gps(self, state: float) -> None:
         self._simulator.link.set_parameter("SIM_GPS_SPOOF", int(state))
@@ -174,13 +176,13 @@ class Trial(Run):
 
     def set_home(self, up_m: float) -> None:
         """Set the home so far above the ground on which it was."""
-        place = *at_degrees(*self._scenario.home_m), self._simulator.ground_alt_m + up_m
+        place = *to_degrees(*self._scenario.home_m), self._simulator.ground_alt_m + up_m
         self._simulator.link.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, *place)
 
     def set_origin(self, east_m: float, up_m: float) -> None:
         """Set the origin of the local frame so far east of the place where it stood, and above it."""
         east_from, north_from = self._scenario.home_m
-        lat, lon = (round(1e7 * degrees) for degrees in at_degrees(east_from + east_m, north_from))
+        lat, lon = (round(1e7 * degrees) for degrees in to_degrees(east_from + east_m, north_from))
         alt_mm = round(1000 * (self._simulator.ground_alt_m + up_m))
         self._simulator.link.send(mavlink.MAVLink_set_gps_global_origin_message(1, lat, lon, alt_mm))
 
@@ -188,7 +190,7 @@ class Trial(Run):
         """Take the autopilot's power away and give it back; it keeps its parameters."""
         self._await_edgevpr()
         self._simulator.kill()
-        time.sleep(_OFF_S)
+        time.sleep(_POWER_OFF_S)
         self._simulator.start(wipe=False)
 
     # What happens to edgevpr and to its wire
@@ -198,7 +200,7 @@ class Trial(Run):
         self._await_edgevpr()
         for name, value in SET_UPS[self._flight.set_up].parameters.items():
             self._simulator.link.set_parameter(name, value)
-        time.sleep(_SAVED_S)
+        time.sleep(_PARAMETER_SAVE_S)
 
     def lose_requests(self, seconds: float) -> None:
         """Let no request for a parameter reach the autopilot until so long after the first."""
@@ -221,21 +223,21 @@ class Trial(Run):
 
     def stop_edgevpr(self, seconds: float) -> None:
         """Give edgevpr no processor for so long."""
-        goes_on_s = time.monotonic() + seconds
+        resume_s = time.monotonic() + seconds
         self._edgevpr.send_signal(signal.SIGSTOP)
 
-        def go_on(now_s: float) -> None:
-            if now_s >= goes_on_s:
+        def resume(now_s: float) -> None:
+            if now_s >= resume_s:
                 self._edgevpr.send_signal(signal.SIGCONT)
-                del self._each_turn["stopped"]
+                del self._repeated_actions["stopped"]
 
-        self._each_turn["stopped"] = go_on
+        self._repeated_actions["stopped"] = resume
 
     def freeze(self, is_frozen: float) -> None:
         self._camera.is_frozen = bool(is_frozen)
 
     def pause(self) -> None:
-        wish = (1, EDGEVPR, mavlink.MAV_CMD_USER_1, 0, _PAUSE, 0, 0, 0, 0, 0, 0)
+        wish = (1, EDGEVPR, mavlink.MAV_CMD_USER_1, 0, _PAUSE_REQUEST, 0, 0, 0, 0, 0, 0)
         self._simulator.link.send(mavlink.MAVLink_command_long_message(*wish))
 
     def saturate(self, bytes_per_s: float) -> None:
@@ -247,11 +249,11 @@ class Trial(Run):
 
         def send(_now_s: float) -> None:
             numbers = (round(time.time() * 1e6), 0, mavlink.MAV_FRAME_BODY_FRD, 0.1, 0.1, 20.0, 0.0, 0.0)
-            self._relay.inject(mavlink.MAVLink_landing_target_message(*numbers).pack(packer), is_heard=True)
+            self._relay.inject(mavlink.MAVLink_landing_target_message(*numbers).pack(packer), to_edgevpr=True)
 
-        self._each_turn["stamps"] = send
+        self._repeated_actions["stamps"] = send
 
 
-_OF_EDGEVPR = frozenset(
+_EDGEVPR_ACTIONS = frozenset(
     ("adopt", "lose_requests", "restart_edgevpr", "stop_edgevpr", "freeze", "pause", "saturate", "send_other_stamps")
 ) | {"choose_sources"}  # the control has but one set

@@ -10,15 +10,17 @@ from pathlib import Path
 import base
 import numpy as np
 from base import Row
-from cells import CELLS, EVENTS, SET_UPS, WATCHED_S, Flight
+from cells import CELLS, EVENTS, SET_UPS, WATCH_S, Flight
 from figures import read_table
 from recording import EDGEVPR
 
 from edgevpr.runtime.flight.flightlog import read_log
 
-WORSE_M, LATER_S = 3.0, 5.0  # what a flight with edgevpr may be beyond its control
-FIRST_WITHIN_S = 60.0  # after an autopilot has started, which needs 25 s to find its place
-_ON_GPS_M = 5.0  # the estimate is on GPS again from when on it stays this near the truth
+# A flight with edgevpr may be worse than its control by no more.
+MARGIN_M = 3.0
+MARGIN_S = 5.0
+FIRST_POSITION_S = 60.0  # after an autopilot has started, which needs 25 s to find its place
+_GPS_ERROR_M = 5.0  # the estimate is on GPS again from when on it stays this near the truth
 _DISTANCES = {"strayed_m": "strays {:.0f} m", "sank_m": "sinks {:.0f} m", "error_m": "estimate {:.0f} m off"}
 _COLUMNS = {
     "cell": "{cell}",
@@ -36,126 +38,127 @@ _COLUMNS = {
 }
 
 
-def figures_of(folder: Path, flight: Flight) -> Row:
+def compute_flight_figures(folder: Path, flight: Flight) -> Row:
     """Return the figures of a flight, from its folder: of the watched time, the largest distances; and the texts."""
     run, event = json.loads((folder / "run.json").read_text()), EVENTS[flight.event]
     marks_s, track = run["marks_s"], read_table(folder / "track.csv")
     texts = [text.removeprefix("edgevpr: ") for _, sender, text in run["texts"] if sender == EDGEVPR]
     row: Row = {"commit": run["commit"], "cannot": run["cannot"], "warnings": run["warnings"], "texts": texts}
     if run["cannot"]:  # all counts from when on the autopilot had found its place
-        found_s = track["t_s"][(track["error_m"] < _ON_GPS_M) & (track["t_s"] >= marks_s.get("started", math.inf))]
+        found_s = track["t_s"][(track["error_m"] < _GPS_ERROR_M) & (track["t_s"] >= marks_s.get("started", math.inf))]
         began_s = float(found_s[0]) if len(found_s) else math.inf
         row["error_m"] = float(track["error_m"][track["t_s"] >= began_s].max(initial=0.0))
     else:
         began_s = marks_s["event"]
-        track = track[(track["t_s"] >= began_s) & (track["t_s"] <= began_s + WATCHED_S)]
+        track = track[(track["t_s"] >= began_s) & (track["t_s"] <= began_s + WATCH_S)]
         after_s, error_m, height_m = track["t_s"] - began_s, track["error_m"], track["height_m"]
-        row["strayed_m"] = float(distances(np.stack((track["east_m"], track["north_m"]), 1), run["path_m"]).max())
+        points_m = np.stack((track["east_m"], track["north_m"]), axis=1)
+        row["strayed_m"] = float(compute_distances(points_m, run["path_m"]).max())
         row["sank_m"] = float(height_m[0] - height_m.min())
         row["error_m"] = float(error_m.max())
         if event.gps_back_s is not None:
-            row["on_gps_s"] = seconds_until_near(after_s - event.gps_back_s, error_m)
+            row["on_gps_s"] = measure_recovery_s(after_s - event.gps_back_s, error_m)
     if flight.has_edgevpr:
         sent_s = read_table(folder / "sent.csv")["t_s"]
-        row["sent"] = int(((sent_s >= began_s) & (bool(run["cannot"]) | (sent_s <= began_s + WATCHED_S))).sum())
+        row["sent"] = int(((sent_s >= began_s) & (bool(run["cannot"]) | (sent_s <= began_s + WATCH_S))).sum())
         if event.before:
-            due_s = marks_s.get("started", math.inf) if SET_UPS[flight.set_up].sends_beside_gps else began_s
-            row["first_s"] = next((round(float(each - due_s), 1) for each in sent_s if each >= due_s), None)
+            due_s = marks_s.get("started", math.inf) if SET_UPS[flight.set_up].sends_with_gps else began_s
+            row["first_s"] = next((round(float(time_s - due_s), 1) for time_s in sent_s if time_s >= due_s), None)
         if event.silent_s is not None:
             row["sent_though_silent"] = int((sent_s >= began_s + event.silent_s).sum())
-        row["accepted"] = _accepted(folder)
+        row["accepted"] = _count_accepted(folder)
     return row
 
 
-def _accepted(folder: Path) -> str:
+def _count_accepted(folder: Path) -> str:
     """Return how many queries were accepted, of how many: a restart begins another log."""
     queries = [line for log in folder.glob("flight*.jsonl") for line in read_log(log) if line["kind"] == "query"]
     return f"{sum(query['accepted'] for query in queries)} of {len(queries)}"
 
 
-def distances(points_m: np.ndarray, path_m: list) -> np.ndarray:
+def compute_distances(points_m: np.ndarray, path_m: list) -> np.ndarray:
     """Return the distance of each point (N, 2) from a path, a list of corners."""
     corners = np.array(path_m, float)
-    found = np.full(len(points_m), math.inf)
+    distances_m = np.full(len(points_m), math.inf)
     for start, end in pairwise(corners):
         along = end - start
         share = np.clip((points_m - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)
-        found = np.minimum(found, np.hypot(*(points_m - start - share[:, None] * along).T))
-    return found
+        distances_m = np.minimum(distances_m, np.hypot(*(points_m - start - share[:, None] * along).T))
+    return distances_m
 
 
-def seconds_until_near(after_s: np.ndarray, error_m: np.ndarray) -> float | None:
+def measure_recovery_s(after_s: np.ndarray, error_m: np.ndarray) -> float | None:
     """Return after how many seconds the error is small for good; None where it is not at the end."""
-    far = np.flatnonzero((error_m > _ON_GPS_M) & (after_s >= 0))
+    far = np.flatnonzero((error_m > _GPS_ERROR_M) & (after_s >= 0))
     if len(far) == 0:
         return 0.0
     return None if far[-1] == len(after_s) - 1 else round(float(after_s[far[-1] + 1]), 1)
 
 
-def faults(flown: Row, control: Row) -> list[str]:
+def find_faults(figures: Row, control: Row) -> list[str]:
     """Return what is wrong with a flight, by the figures and those of its control."""
     if control["cannot"]:
         return [f"no control: {control['cannot']}"]
-    found = [flown["cannot"]] if flown["cannot"] and not is_refused(flown) else []
-    if flown["cannot"] and flown["error_m"] > control["error_m"] + WORSE_M:
-        found.append(_DISTANCES["error_m"].format(flown["error_m"]))
-    if not flown["cannot"] and not is_refused(flown):
-        worse = [key for key in _DISTANCES if flown[key] > control[key] + WORSE_M]
-        found += [_DISTANCES[key].format(flown[key]) for key in worse]
-        back_s, control_s = flown.get("on_gps_s", 0.0), control.get("on_gps_s", 0.0)
-        if control_s is not None and (back_s is None or back_s > control_s + LATER_S):
-            found.append("not on GPS again" if back_s is None else f"on GPS {back_s - control_s:.0f} s later")
-    first_s = flown.get("first_s", 0.0)
-    if first_s is None or first_s > FIRST_WITHIN_S:
-        found.append("no position in time")
-    if flown.get("sent_though_silent"):
-        found.append(f"{flown['sent_though_silent']} positions though paused")
-    return found
+    faults = [figures["cannot"]] if figures["cannot"] and not is_refused(figures) else []
+    if figures["cannot"] and figures["error_m"] > control["error_m"] + MARGIN_M:
+        faults.append(_DISTANCES["error_m"].format(figures["error_m"]))
+    if not figures["cannot"] and not is_refused(figures):
+        worse = [key for key in _DISTANCES if figures[key] > control[key] + MARGIN_M]
+        faults += [_DISTANCES[key].format(figures[key]) for key in worse]
+        back_s, control_s = figures.get("on_gps_s", 0.0), control.get("on_gps_s", 0.0)
+        if control_s is not None and (back_s is None or back_s > control_s + MARGIN_S):
+            faults.append("not on GPS again" if back_s is None else f"on GPS {back_s - control_s:.0f} s later")
+    first_s = figures.get("first_s", 0.0)
+    if first_s is None or first_s > FIRST_POSITION_S:
+        faults.append("no position in time")
+    if figures.get("sent_though_silent"):
+        faults.append(f"{figures['sent_though_silent']} positions though paused")
+    return faults
 
 
-def is_refused(flown: Row) -> bool:
+def is_refused(figures: Row) -> bool:
     """Tell whether edgevpr sent nothing in the watched time, or the aircraft stayed on the ground, and it has warned: a
     busy computer is a notice."""
-    return bool(flown["warnings"]) and (not flown.get("sent") or bool(flown["cannot"]))
+    return bool(figures["warnings"]) and (not figures.get("sent") or bool(figures["cannot"]))
 
 
-def judged(rows: Mapping[str, Row]) -> list[Row]:
+def judge_cells(rows: Mapping[str, Row]) -> list[Row]:
     """Return a row for each cell of the table that was flown beside its control, by the figures of flights by name."""
-    found = []
+    judged = []
     for name, cell in CELLS.items():
-        flown, control = rows.get(name), rows.get(cell.control.name)
-        if flown and control:
-            wrong = faults(flown, control)
-            verdict = "; ".join(wrong) or ("refused" if is_refused(flown) else "right")
-            own = {"cell": name, "beside": cell.control.name, "verdict": verdict, "is_right": not wrong}
-            found.append({**own, "with": flown, "control": control})
-    return found
+        figures, control = rows.get(name), rows.get(cell.control.name)
+        if figures and control:
+            wrong = find_faults(figures, control)
+            verdict = "; ".join(wrong) or ("refused" if is_refused(figures) else "right")
+            fields = {"cell": name, "beside": cell.control.name, "verdict": verdict, "is_right": not wrong}
+            judged.append({**fields, "with": figures, "control": control})
+    return judged
 
 
-def page(result: Row) -> str:
+def format_page(result: Row) -> str:
     """Return the page for people."""
     cells = result["cells"]
     wrong = [row for row in cells if not row["is_right"]]
     texts = "\n".join(f"* {row['cell']}: {'; '.join(row['with']['texts']) or 'none'}" for row in cells)
     other = [f"{row['cell']} (by {row['beside']})" for row in cells if CELLS[row["cell"]].control.has_edgevpr]
     commits = Counter(row["with"]["commit"] for row in cells)
-    flown = ", ".join(f"{commit} ({count} cells)" for commit, count in commits.items())
+    versions = ", ".join(f"{commit} ({count} cells)" for commit, count in commits.items())
     return f"""# Never worse than alone
 
 A real ArduPilot or PX4 in its own simulator, with edgevpr, and the same flight without it: {len(cells)} of {len(CELLS)}
 cells of the table (benchmarks/rig/cells.py: set-up, event, and what the camera recognises) are flown, {len(wrong)} are
-worse. A copter hovers 100 m high or flies a leg, a plane circles; then comes the event, and {WATCHED_S:.0f} s are
+worse. A copter hovers 100 m high or flies a leg, a plane circles; then comes the event, and {WATCH_S:.0f} s are
 watched.
 
 Metres, the largest of that time: how far the aircraft strays from where it should fly, how far it sinks, and how far
 its autopilot's estimate is from the truth; beside each the same of the control. Seconds from the moment at which GPS is
-as before until the estimate stays within {_ON_GPS_M:.0f} m. Positions sent; queries accepted in all of the flight.
+as before until the estimate stays within {_GPS_ERROR_M:.0f} m. Positions sent; queries accepted in all of the flight.
 
-Right: nothing is more than {WORSE_M:.0f} m worse than the control, GPS is used again {LATER_S:.0f} s later than by it
-at the latest, after a start of the autopilot positions come within {FIRST_WITHIN_S:.0f} s, and none while paused.
+Right: nothing is more than {MARGIN_M:.0f} m worse than the control, GPS is used again {MARGIN_S:.0f} s later than by it
+at the latest, after a start of the autopilot positions come within {FIRST_POSITION_S:.0f} s, and none while paused.
 Refused: edgevpr sends nothing, or the aircraft does not arm, and it has warned.
 
-{base.table(cells, _COLUMNS)}
+{base.format_table(cells, _COLUMNS)}
 
 Where edgevpr is needed, the control has it too and lacks a part of the event: {", ".join(other) or "none"}.
 
@@ -163,5 +166,5 @@ What edgevpr reported to the ground station:
 
 {texts}
 
-Flown with edgevpr at {flown}. {base.made_line(result, "make never-worse")}
+Flown with edgevpr at {versions}. {base.format_origin(result, "make never-worse")}
 """

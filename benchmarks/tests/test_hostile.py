@@ -22,10 +22,10 @@ def test_run_damaged_maps_reports_no_traceback_no_wrong_position_and_no_lost_pla
 @needs_sets
 def test_map_of_downward_images_refuses_forward_images(tmp_path):
     folder = base.DATA / "aerial_brighton"
-    recogniser = hostile_pictures.mapped(folder, tmp_path)
+    recogniser = hostile_pictures.open_set_map(folder, tmp_path)
     with recogniser.place_map:
-        assert not any(recogniser.step(walks.frame(base.DATA / path)).accepted for path in AHEAD)
-        assert recogniser.step(walks.frame(min((folder / "query").iterdir()))).accepted
+        assert not any(recogniser.step(walks.make_frame(base.DATA / path)).accepted for path in AHEAD)
+        assert recogniser.step(walks.make_frame(min((folder / "query").iterdir()))).accepted
 
 
 @needs_sets

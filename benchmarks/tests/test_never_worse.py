@@ -12,11 +12,11 @@ import verdicts
 from cells import CELLS, EVENTS, MATCHES, SET_UPS, Flight
 from trial import Trial
 
-ALONE = {"cannot": None, "warnings": [], "strayed_m": 0.1, "sank_m": 0.2, "error_m": 0.5, "on_gps_s": 1.0}
-FLOWN = ALONE | {"commit": "abc", "sent": 1200, "accepted": "0 of 60", "texts": ["map left"]}
+CONTROL_ROW = {"cannot": None, "warnings": [], "strayed_m": 0.1, "sank_m": 0.2, "error_m": 0.5, "on_gps_s": 1.0}
+FLIGHT_ROW = CONTROL_ROW | {"commit": "abc", "sent": 1200, "accepted": "0 of 60", "texts": ["map left"]}
 
 
-def test_cells_are_many_and_can_be_flown():
+def test_cells_are_many_and_make_scenarios():
     assert len(CELLS) >= 60
     assert 3 <= sum(cell.is_quick for cell in CELLS.values()) <= 6
     assert set(MATCHES) == {cell.flight.matches for cell in CELLS.values()}
@@ -28,8 +28,8 @@ def test_cells_are_many_and_can_be_flown():
         assert "VISO_TYPE" in set_up.parameters or "choose_sources" not in actions
         assert cell.control != cell.flight
         assert EVENTS[cell.control.event].gps_back_s == event.gps_back_s
-        cell.flight.scenario()
-        cell.control.scenario()
+        cell.flight.make_scenario()
+        cell.control.make_scenario()
 
 
 def test_controls_are_shared():
@@ -54,17 +54,17 @@ def test_controls_are_shared():
         ({"cannot": "never ready", "error_m": 40.0}, "never ready; estimate 40 m off"),
     ],
 )
-def test_judged_by_the_control(changed, verdict):
+def test_judge_cells_compares_each_with_its_control(changed, verdict):
     name = "gps_input-gps_back-none"
-    (row,) = verdicts.judged({name: FLOWN | changed, "copter-gps_back": ALONE})
+    (row,) = verdicts.judge_cells({name: FLIGHT_ROW | changed, "copter-gps_back": CONTROL_ROW})
     assert row["verdict"] == verdict
     assert row["is_right"] == (verdict in ("right", "refused"))
-    page = verdicts.page({"cells": [row], "commit": "abc", "date": "today", "machine": {"cpu": "one"}})
+    page = verdicts.format_page({"cells": [row], "commit": "abc", "date": "today", "machine": {"cpu": "one"}})
     assert f"| {verdict} |" in page
-    assert f"* {name}: {FLOWN['texts'][0]}" in page
+    assert f"* {name}: {FLIGHT_ROW['texts'][0]}" in page
 
 
-def test_figures_of_a_flight(tmp_path):
+def test_compute_flight_figures_measures_flight_until_gps_is_back(tmp_path):
     """A hover, of which the estimate and the aircraft run away together until GPS is back at 50 s."""
     columns = "t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode,height_m"
     lines = []
@@ -77,19 +77,20 @@ def test_figures_of_a_flight(tmp_path):
         + "".join(f"{t},GPS_INPUT,0,600,450,1,600,450\n" for t in range(990, 1200, 10))
     )
     (tmp_path / "flight.jsonl").write_text(
-        "".join(f'{{"kind": "query", "accepted": {each}}}\n' for each in ("true", "false"))
+        "".join(f'{{"kind": "query", "accepted": {accepted}}}\n' for accepted in ("true", "false"))
     )
     texts = [[1003.0, 1, "EKF Failsafe"], [1004.0, 197, "edgevpr: map left"]]
     run = {"commit": "abc", "cannot": None, "warnings": [], "texts": texts, "marks_s": {"event": 1000.0}}
     (tmp_path / "run.json").write_text(json.dumps(run | {"path_m": [(600, 450), (600, 450)]}))
 
-    found = verdicts.figures_of(tmp_path, Flight("gps_input", "gps_back", "right"))
+    figures = verdicts.compute_flight_figures(tmp_path, Flight("gps_input", "gps_back", "right"))
 
-    assert (found["strayed_m"], found["error_m"], found["sank_m"]) == pytest.approx((40, 40, 4), abs=0.1)
-    assert found["on_gps_s"] == pytest.approx(10.0, abs=0.11)
-    assert (found["sent"], found["accepted"], found["texts"]) == (13, "1 of 2", ["map left"])
+    assert (figures["strayed_m"], figures["error_m"], figures["sank_m"]) == pytest.approx((40, 40, 4), abs=0.1)
+    assert figures["on_gps_s"] == pytest.approx(10.0, abs=0.11)
+    assert (figures["sent"], figures["accepted"], figures["texts"]) == (13, "1 of 2", ["map left"])
 
 
-def test_distance_from_a_path():
+def test_compute_distances_measures_distance_from_path():
     path_m = [(0, 0), (10, 0), (10, 10)]
-    assert verdicts.distances(np.array([(5.0, 3.0), (12.0, 5.0), (-3.0, 4.0)]), path_m) == pytest.approx([3, 2, 5])
+    points_m = np.array([(5.0, 3.0), (12.0, 5.0), (-3.0, 4.0)])
+    assert verdicts.compute_distances(points_m, path_m) == pytest.approx([3, 2, 5])

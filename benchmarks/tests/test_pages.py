@@ -47,19 +47,19 @@ def test_scripts_can_be_loaded(name):
 @pytest.mark.parametrize("name", PAGES)
 def test_page_matches_its_results(name):
     page = (base.RESULTS / f"{name}.md").read_text("utf-8")
-    assert load_script(PAGES[name]).page(base.read(name)).strip() + "\n" == page
+    assert load_script(PAGES[name]).format_page(base.read(name)).strip() + "\n" == page
 
 
 def test_thesis_page_matches_its_results():
-    page = (base.REPOSITORY / "docs" / "thesis.md").read_text("utf-8")
-    assert page == thesis_page.page(thesis_values.read_results(base.RESULTS)), "python benchmarks/thesis.py --page"
+    page = thesis_page.format_page(thesis_values.read_results(base.RESULTS))
+    assert (base.REPOSITORY / "docs" / "thesis.md").read_text("utf-8") == page, "python benchmarks/thesis.py --page"
 
 
 def test_figures_page_matches_its_results(tmp_path):
     page, copy = base.REPOSITORY / "docs" / "figures.md", tmp_path / "figures.md"
     copy.write_text(page.read_text("utf-8"), "utf-8")
     contents = sets_page.read_sets(base.RESULTS)
-    figures_page.put(copy, f"{figures_page.recall(contents)}\n\n{figures_page.speed()}")
+    figures_page.replace_figures(copy, f"{figures_page.format_recall(contents)}\n\n{figures_page.format_speed()}")
     assert copy.read_text("utf-8") == page.read_text("utf-8"), "python benchmarks/figures_page.py"
 
 
@@ -71,15 +71,15 @@ def test_pages_link_only_existing_pictures():
 
 def test_shipped_counts_match_the_benchmark():
     parts = {row["part"]: row["instructions"] for row in base.read("arm64")["parts"]}
-    assert counted.figures(parts) == json.loads(COUNTED_PATH.read_text())
+    assert counted.compute_counts(parts) == json.loads(COUNTED_PATH.read_text())
 
 
-def test_printed_digits_bound_what_they_were_rounded_from():
-    value, least, most = thesis_values.corners(lambda a, b: a * b, ["0.50", "20"])
+def test_bound_formula_covers_what_printed_digits_were_rounded_from():
+    value, least, most = thesis_values.bound_formula(lambda a, b: a * b, ["0.50", "20"])
     assert (value, least, most) == pytest.approx((10, 0.495 * 19.5, 0.505 * 20.5))
 
 
-def test_pcu_of_a_table_row_is_that_of_its_printed_numbers():
-    assert thesis_values.printed_pcu("CoHOG")[0] == pytest.approx(0.84 * math.log10(0.83 / 0.02 + 9))
-    assert thesis_values.printed_pcu("AMOSNet")[2] is None  # it was trained on that set
-    assert thesis_values.printed_pcu("Cross-Region-BoW")[1] == pytest.approx(0.81)  # the slowest: its precision
+def test_compute_table_pcu_uses_printed_numbers():
+    assert thesis_values.compute_table_pcu("CoHOG")[0] == pytest.approx(0.84 * math.log10(0.83 / 0.02 + 9))
+    assert thesis_values.compute_table_pcu("AMOSNet")[2] is None  # it was trained on that set
+    assert thesis_values.compute_table_pcu("Cross-Region-BoW")[1] == pytest.approx(0.81)  # the slowest: its precision

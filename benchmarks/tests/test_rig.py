@@ -16,15 +16,15 @@ import figures
 import truth
 
 
-def degrees(east_m: float, north_m: float) -> tuple[float, float]:
-    at = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
-    return at.lat_deg, at.lon_deg
+def to_degrees(east_m: float, north_m: float) -> tuple[float, float]:
+    position = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
+    return position.lat_deg, position.lon_deg
 
 
-def test_truth_interpolates_a_turn_between_two_states():
+def test_compute_pose_extrapolates_a_turn_after_two_states():
     """Banked by 30 degrees, the nose turns at g tan(30) / v: 14.7 degrees a second at 22 m/s."""
     roll, turn = np.radians(30.0), 9.81 * np.tan(np.radians(30.0)) / 22.0
-    lat_deg, lon_deg = degrees(500.0, 300.0)
+    lat_deg, lon_deg = to_degrees(500.0, 300.0)
     state = SimpleNamespace(
         get_type=lambda: "SIM_STATE",
         lat_int=round(lat_deg * 1e7),
@@ -40,16 +40,17 @@ def test_truth_interpolates_a_turn_between_two_states():
         vn=22.0,
         vd=1.0,
     )
-    told = truth.Truth()
-    told.listen(state, 10.0)
-    at = told.at(10.1)
-    assert (at.east_m, at.north_m, at.height_m) == pytest.approx((500.0, 302.2, 99.9), abs=0.02)
-    assert (at.roll_deg, at.pitch_deg, at.heading_deg) == pytest.approx((30.0, 0.0, 350.0 + np.degrees(turn) / 10))
-    assert told.at(9.9) is None  # nothing is known of before
-    assert told.at(10.5) is None  # nor of so long after
+    states = truth.Truth()
+    states.handle_message(state, 10.0)
+    pose = states.compute_pose(10.1)
+    assert (pose.east_m, pose.north_m, pose.height_m) == pytest.approx((500.0, 302.2, 99.9), abs=0.02)
+    heading_deg = 350.0 + np.degrees(turn) / 10
+    assert (pose.roll_deg, pose.pitch_deg, pose.heading_deg) == pytest.approx((30.0, 0.0, heading_deg))
+    assert states.compute_pose(9.9) is None  # nothing is known of before
+    assert states.compute_pose(10.5) is None  # nor of so long after
 
 
-def test_figures_of_a_run(tmp_path):
+def test_compute_run_figures_measures_run_after_gps_loss(tmp_path):
     """GPS is lost at 100 s; the estimate drifts at 2 m/s for ten seconds, and the pictures were taken at the truth."""
     columns = "t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode"
     lines = [f"{t:.1f},500,300,500,300,{2 * max(t - 100, 0):.2f},10" for t in np.arange(95, 110.05, 0.1)]
@@ -71,7 +72,7 @@ def test_figures_of_a_run(tmp_path):
             "t_mono_s": t + 0.2,
             "accepted": True,
             "accuracy_m": 2.0,
-            "located": dict(zip(("lat_deg", "lon_deg"), degrees(east, 300.0), strict=True)),
+            "located": dict(zip(("lat_deg", "lon_deg"), to_degrees(east, 300.0), strict=True)),
         }
         for t, east in located
     ]
@@ -82,21 +83,21 @@ def test_figures_of_a_run(tmp_path):
     run = {"commit": "abc", "marks_s": {"loss": 100.0}, "texts": texts}
     (tmp_path / "run.json").write_text(json.dumps(run))
 
-    found = figures.figures_of(tmp_path)
+    result = figures.compute_run_figures(tmp_path)
 
-    assert found["estimate"]["after"]["median"] == pytest.approx(10.0, abs=0.2)
-    assert found["estimate"]["at_s"] == {"10": 20.0}
-    assert found["modes"] == [[0.0, 10]]
-    assert found["alarms"] == [[3.0, "EKF Failsafe"]]
-    assert found["fixes"]["error"] == {"n": 2, "median": 2.0, "p90": 2.8, "max": 3.0}
-    assert found["fixes"]["by_roll_deg"]["20-90"]["max"] == 1.0
-    assert found["fixes"]["within"] == [0.75, 1.0]
-    assert found["sent"]["COMMAND_INT"]["error"]["max"] == 3.0
-    assert found["wire_ms"] == [100.0, 100.0]
-    assert found["gps_alarms_s"] == [7.0]
-    assert found["answers"] == {"ACCEPTED": 2}
+    assert result["estimate"]["after"]["median"] == pytest.approx(10.0, abs=0.2)
+    assert result["estimate"]["at_s"] == {"10": 20.0}
+    assert result["modes"] == [[0.0, 10]]
+    assert result["alarms"] == [[3.0, "EKF Failsafe"]]
+    assert result["fixes"]["error"] == {"n": 2, "median": 2.0, "p90": 2.8, "max": 3.0}
+    assert result["fixes"]["by_roll_deg"]["20-90"]["max"] == 1.0
+    assert result["fixes"]["within"] == [0.75, 1.0]
+    assert result["sent"]["COMMAND_INT"]["error"]["max"] == 3.0
+    assert result["wire_ms"] == [100.0, 100.0]
+    assert result["gps_alarms_s"] == [7.0]
+    assert result["answers"] == {"ACCEPTED": 2}
 
 
-def test_worse_than_without_compares_the_worst_seconds():
-    assert figures.worse_by(np.array([1.0, 5.0, 2.0]), np.array([2.0, 1.0, 9.0, 20.0])) == (4.0, 1)
-    assert to_metres(*degrees(12.0, 34.0)) == pytest.approx((12.0, 34.0), abs=1e-6)
+def test_compare_estimates_finds_the_worst_second():
+    assert figures.compare_estimates(np.array([1.0, 5.0, 2.0]), np.array([2.0, 1.0, 9.0, 20.0])) == (4.0, 1)
+    assert to_metres(*to_degrees(12.0, 34.0)) == pytest.approx((12.0, 34.0), abs=1e-6)

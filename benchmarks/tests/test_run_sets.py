@@ -52,12 +52,12 @@ def test_measure_places_site_sets_and_measures_known_headings(tmp_path):
     measure(tmp_path / "data", tmp_path / "out", "--variants", "cohog, known")
     assert not (tmp_path / "out" / "meadow.json").exists(), "it has no headings"
     (content,) = sets_page.read_sets(tmp_path / "out")
-    found = content["techniques"]["cohog, known"]
-    assert (found["known"], found["parameters"]["camera"]) == ("heading,height", "nadir")
+    row = content["techniques"]["cohog, known"]
+    assert (row["known"], row["parameters"]["camera"]) == ("heading,height", "nadir")
 
-    placed = run_sets.placed(tmp_path / "data" / "sat_town", tmp_path)
+    placed = run_sets.place_sites(tmp_path / "data" / "sat_town", tmp_path)
     tags = [read_positions(placed / "positions.csv")[f"ref{n}.png"] for n in range(4)]
-    at = [(tag.position.lat_deg, tag.position.lon_deg) for tag in tags]
-    assert distance_m(*at[0], *at[1]) == pytest.approx(120, abs=0.1)
-    assert distance_m(*at[0], *at[2]) > 10_000
+    positions = [(tag.position.lat_deg, tag.position.lon_deg) for tag in tags]
+    assert distance_m(*positions[0], *positions[1]) == pytest.approx(120, abs=0.1)
+    assert distance_m(*positions[0], *positions[2]) > 10_000
     assert tags[0].heading_deg == 0

@@ -78,7 +78,7 @@ def label_site(folder: Path, looks_down: bool, seed: int) -> list[Labelled]:
     answers = []
     for name in TECHNIQUES:
         turns = looks_down and name in TURNS
-        with walks.walk_over(places, name, looks_down) as walk:
+        with walks.open_walk(places, name, looks_down) as walk:
             asked = progress(questions, len(questions), f"{folder.name}, {name}")
             answers.append([_answer(walk, question, turns) for question in asked])
     return list(map(Labelled, questions, np.mean(answers, axis=0).tolist()))
@@ -109,7 +109,7 @@ def _questions(folder: Path, places: list[Path], seed: int) -> list[Question]:
         asked += [Question(path, (seed, slot, change), frozenset({slot}), near) for change in range(CHANGES)]
     truth = folder / "ground_truth.csv"
     numbers = {path.name: slot for slot, path in enumerate(places)}
-    for query in walks.dataset_of(folder).queries if truth.is_file() else ():
+    for query in walks.load_matched_set(folder).queries if truth.is_file() else ():
         right, ignored = (frozenset(numbers[name] for name in names) for names in (query.right, query.ignored))
         asked.append(Question(query.path, None, right, ignored))
     return asked
@@ -117,7 +117,7 @@ def _questions(folder: Path, places: list[Path], seed: int) -> list[Question]:
 
 def _answer(walk: Recogniser, question: Question, turns: bool) -> bool:
     """Tell whether a right place scores higher than all others."""
-    ranking = walk.step(walks.frame(question.picture(turns))).ranking
+    ranking = walk.step(walks.make_frame(question.picture(turns))).ranking
     if ranking is None:
         return False
     scores = dict(zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True))
@@ -247,7 +247,7 @@ def write_network(
 def main() -> None:
     """Fit a network to all sets that it may learn from."""
     labelled = {
-        folder.name: label_site(folder, base.camera_of(folder.name) == "nadir", 1)
+        folder.name: label_site(folder, base.infer_camera(folder.name) == "nadir", 1)
         for folder in base.find_sets()
         if folder.name not in NOT_LEARNT
     }
