@@ -121,7 +121,10 @@ def format_check(result: "MapCheck") -> Iterator[str]:
 
 def format_replay(replay: "ReplayResult", lines: "LineComparison", packets: "PacketComparison") -> Iterator[str]:
     """Yield how a replay differs from its flight: in the `lines` of its log, the `packets` it sent, and its end."""
-    yield from _limit_differences([*map(_format_difference, lines.others), *packets.others])
+    differences = [*map(_format_difference, lines.others), *packets.others]
+    yield from differences[:_MAX_DIFFERENCES]
+    if (omitted := len(differences) - _MAX_DIFFERENCES) > 0:
+        yield f"... and {omitted} more (--json has all)"
     yield from (f"The program differs: {name} was {old}, is {new}" for name, (old, new) in lines.program.items())
     yield f"{sum(line.get('kind') == 'query' for line in replay.lines)} queries replayed"
     yield f"log      {lines.alike} lines are equal, {len(lines.others)} differ"
@@ -132,11 +135,6 @@ def format_replay(replay: "ReplayResult", lines: "LineComparison", packets: "Pac
         yield f"The replay ended before the flight: {replay.why_ended}; the flight has {lines.after} more lines."
     elif lines.after:
         yield f"{lines.after} lines of the flight are missing from the replay."
-
-
-def _limit_differences(texts: list[str]) -> list[str]:
-    omitted = len(texts) - _MAX_DIFFERENCES
-    return texts[:_MAX_DIFFERENCES] + ([f"... and {omitted} more (--json has all)"] if omitted > 0 else [])
 
 
 def _format_difference(difference: dict[str, Any]) -> str:

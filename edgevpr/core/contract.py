@@ -39,7 +39,7 @@ class TechniqueSpec:
     `packed`: the row of a place in the index in RAM, made by `Technique.pack`. None: the row is the coarse part.
 
     A map does not store the other fields. They describe optional abilities:
-    `form`: number format of vectors in RAM, one of `forms`, which are listed largest first. None: no choice.
+    `form`: number format of vectors in RAM, see `techniques.vectors`. None: no choice.
     `sequence`: default number of queries that are matched together.
     `scan_counts`: the score of the scan is part of the final score (see `places.retrieve`).
     `heading_within_deg`: if headings are known, only rotations of the query within this many degrees of the expected
@@ -58,7 +58,6 @@ class TechniqueSpec:
     model_sha256: str | None = None
     packed: PartSpec | None = None
     form: str | None = field(default=None, compare=False)
-    forms: tuple[str, ...] = field(default=(), compare=False)
     sequence: int = field(default=1, compare=False)
     scan_counts: bool = field(default=False, compare=False)
     heading_within_deg: float | None = field(default=None, compare=False)

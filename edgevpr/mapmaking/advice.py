@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Image, Singles
+from edgevpr.core.arrays import Image, Singles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
@@ -195,7 +195,9 @@ def measure_static_fraction(images: Iterable[Image], mask: OverlayMask | None) -
     for image in images:
         dx, dy = _compute_gradients(image)
         x, y, strength, count = x + dx, y + dy, strength + cv2.magnitude(dx, dy), count + 1
-        allowed &= _shrink_mask(mask.fit_to(image)) if mask else True
+        if mask:
+            shown = mask.fit_to(image).view(np.uint8)
+            allowed &= cv2.resize(shown, _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
     if count < _MIN_DISPLAY_PICTURES:
         return None
     edges = allowed & (strength >= _MIN_EDGE * count)
@@ -209,10 +211,6 @@ def _compute_gradients(image: Image) -> tuple[Singles, Singles]:
     grey = cv2.resize(grey.astype(np.float32), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_AREA)
     dx, dy = (cv2.Sobel(grey, cv2.CV_32F, x_order, 1 - x_order, scale=1 / 8) for x_order in (1, 0))
     return np.asarray(dx, np.float32), np.asarray(dy, np.float32)
-
-
-def _shrink_mask(allowed: Bools) -> Bools:
-    return cv2.resize(allowed.view(np.uint8), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def _open_video(uri: str) -> Source:

@@ -105,7 +105,8 @@ class Orthophoto:
         if not np.isfinite(corners).all():
             return _make_blank(side_px)
         source_px = np.hypot(*(corners[1] - corners[0]))
-        shrink = _compute_shrink_factor(source_px, side_px)
+        # The file is reduced by this power of two before it is warped.
+        shrink = 1 << min(int(np.log2(max(source_px / side_px, 1))), _MAX_HALVINGS)
         size = np.array([self._raster.width, self._raster.height])
         low = np.clip(corners.min(axis=0) - 2 * shrink, 0, size).astype(int) // shrink * shrink
         high = np.clip(corners.max(axis=0) + 3 * shrink, 0, size).astype(int) // shrink * shrink
@@ -136,11 +137,6 @@ class Orthophoto:
 def _apply_affine(affine: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Apply an affine transform to x and y (scalars or arrays). Affine's own operator differs between its releases."""
     return affine.a * x + affine.b * y + affine.c, affine.d * x + affine.e * y + affine.f
-
-
-def _compute_shrink_factor(source_px: float, side_px: int) -> int:
-    """Return the power of two by which the file is reduced before `source_px` pixels become `side_px`."""
-    return 1 << min(int(np.log2(max(source_px / side_px, 1))), _MAX_HALVINGS)
 
 
 def _make_blank(side_px: int) -> tuple[Image, Bools]:

@@ -59,10 +59,6 @@ class Lattice:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def locate_place(self, index: int) -> Position:
-        """Return the position of one place."""
-        return Position(float(self.lat_deg[index]), float(self.lon_deg[index]))
-
 
 class OrthophotoSource(RecordingSource):
     """Source of one frame, a square of ground, for each place of the grids `lattices` (one grid per footprint).
@@ -98,7 +94,7 @@ class OrthophotoSource(RecordingSource):
         name = f"{self.short_name}{footprint_suffix}_r{row}_c{column}"
         if not self.is_selected(name):
             return None
-        position = lattice.locate_place(index)
+        position = Position(float(lattice.lat_deg[index]), float(lattice.lon_deg[index]))
         try:
             image, valid = self._orthophoto.cut(position, lattice.footprint_m, SIDE_PX)
         except ImageError:

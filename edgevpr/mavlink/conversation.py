@@ -163,7 +163,8 @@ class Conversation:
             if self.autopilot.answer:
                 self._handle_answer(self.autopilot.answer, now_s)
             if not self.autopilot.identity.is_foreign(sender):
-                self._handle_request(message, now_s)
+                own_id = self._packer.srcSystem, self._packer.srcComponent
+                self.send(*self.requests.handle(message, own_id, now_s))
                 self._handle_stamp(message, now_s)
         return has_heartbeat
 
@@ -319,9 +320,6 @@ class Conversation:
             return
         if wrong_stamp := autopilot.foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
             self.announce(Severity.WARNING, f"bad timestamps: {wrong_stamp}", "stamps")
-
-    def _handle_request(self, message: Message, now_s: float) -> None:
-        self.send(*self.requests.handle(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
 
     def _handle_answer(self, answer: str, now_s: float) -> None:
         transmission = self.fixes.handle(answer, self.autopilot.assess_readiness(now_s).explain(answer), now_s)

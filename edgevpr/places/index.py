@@ -55,11 +55,6 @@ class PlaceIndex:
     def nbytes(self) -> int:
         return sum(array.nbytes for array in self.arrays.values())
 
-    @property
-    def has_headings(self) -> bool:
-        """True if at least one place has a heading."""
-        return not np.isnan(self.heading_deg).all()
-
     def select(self, slots: slice | Array) -> "PlaceIndex":
         """Return the index of the places at `slots` only. Its arrays are views if `slots` is a slice, and copies if it
         is an array of slots or a mask, bool (N,)."""

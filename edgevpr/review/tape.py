@@ -184,16 +184,14 @@ class Playback(Tape):
 
     def _peek_kind(self) -> str:
         """Perform the link's turns next on the tape; return the kind of the note after them. Raises TapeEnded."""
-        while note := self._peek_note():
+        while self._index < len(self._notes):
+            note = self._notes[self._index]
             if note[0] != LINK or self.perform_turn is None:
                 return cast(str, note[0])
             self._index += 1
             self.t_s = max(self.t_s, note[1])
             self.perform_turn(note[1], note[2])
         raise TapeEnded
-
-    def _peek_note(self) -> Note | None:
-        return self._notes[self._index] if self._index < len(self._notes) else None
 
     def _has_answer(self, kind: str) -> bool:
         """Return True if a value of `kind`, or the end of the flight, comes before the next frame. Return False for a

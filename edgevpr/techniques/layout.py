@@ -143,7 +143,8 @@ def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) ->
     shifted = np.stack([padded[:, y : y + n, x : x + n] for y, x in windows])
     strength = (place**2).sum(axis=0)
     scatter_sq = ((shifted**2).sum(axis=1) * strength).sum(axis=(1, 2))
-    scatter_sq = np.maximum(scatter_sq, _MIN_SCATTER**2 * _measure_strength(query) * strength.sum())
+    query_strength = float((query**2).sum() / query[0].size)  # mean over its cells
+    scatter_sq = np.maximum(scatter_sq, _MIN_SCATTER**2 * query_strength * strength.sum())
     scores = np.einsum("scij,cij->s", shifted, place) / (np.sqrt(scatter_sq + _TINY) * n)
     return float(np.clip(scores.max(), 0, 1))
 
@@ -170,11 +171,6 @@ def _compare_fields(grid: Grid, queries: list[Singles], packed: Bytes) -> Single
         strength = np.einsum("nd,nd->n", places, places)
         best[start : start + len(part)] = (scores / np.sqrt(strength + _TINY)).T
     return best
-
-
-def _measure_strength(field: Array) -> float:
-    """Return the mean square of the length of the vectors in the cells of a field (C, m, m)."""
-    return float((field**2).sum() / field[0].size)
 
 
 def _pad_field(query: Array, n: int) -> Array:

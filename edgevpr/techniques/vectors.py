@@ -69,7 +69,6 @@ class VectorTechnique:
             model_sha256=model_sha256,
             packed=packed[form],
             form=form,
-            forms=FORMS,
         )
 
     def make_vector(self, image: Image, mask: Mask | None) -> Singles:

@@ -123,11 +123,6 @@ def auc_from_zero(precision: np.ndarray, recall: np.ndarray) -> float:
     return float((1 + precision[0]) / 2 * recall[0]) + auc_2_3(precision, recall)
 
 
-def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Return the largest recall at which every accepted match is correct; 0 if the best-scoring match is wrong."""
-    return float(recall[precision == 1].max(initial=0))
-
-
 def precision_at_100_recall(precision: np.ndarray, recall: np.ndarray) -> float:
     """Return the precision with the threshold at the lowest-scoring correct match: never below recall@1."""
     return float(precision[np.argmax(recall)])
@@ -162,7 +157,7 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
     """Compute the figures of at least one query."""
     correct = ranks == 0
     precision, recall = precision_recall(scores, correct)
-    recall_at_100 = recall_at_100_precision(precision, recall)
+    recall_at_100 = float(recall[precision == 1].max(initial=0))  # at 100 % precision; 0 if the best match is wrong
     recalls: dict[str, Any] = {f"recall_at_{k}": float(np.mean(ranks < k)) for k in (1, 5, 10)}
     recalls |= {f"recall_at_{k}_interval": wilson_interval(ranks < k) for k in (1, 5, 10)}
     return Figures(

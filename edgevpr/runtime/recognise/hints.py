@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from edgevpr.core.contract import find_nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, wrap_deg
@@ -273,7 +275,7 @@ def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIn
     """Return the hints that narrow a search of the index (None: no hints). An area with all places or none does not."""
     if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
-    if not index.has_headings:
+    if np.isnan(index.heading_deg).all():
         heading_deg = None
     return Hints(reach, heading_deg).select(*_TRUST_ALL)
 
