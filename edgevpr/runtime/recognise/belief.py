@@ -130,11 +130,13 @@ class Proposals:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
     """Belief after a query: the probability of being `lost`, the `probability` (K,) of each candidate of the query,
-    and an estimate of the `position` (2,), its `covariance` (2, 2), and the heading (None: unknown). `mass` is the
-    total probability of the hypotheses near it; without any, the estimate is NaN."""
+    the one `predicted` (K,) from the earlier queries, and an estimate of the `position` (2,), its `covariance` (2, 2),
+    and the heading (None: unknown). `mass` is the total probability of the hypotheses near it; without any, the
+    estimate is NaN."""
 
     lost: float
     probability: Doubles
+    predicted: Doubles
     mass: float = 0.0
     position: Doubles = field(default_factory=lambda: np.full(2, np.nan))
     covariance: Doubles = field(default_factory=lambda: np.full((2, 2), np.nan))
@@ -151,6 +153,17 @@ class Belief:
         shapes |= {"credited": 0, "anchor": (0, 2)}
         self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
+    def drop_off_map(self, places: Doubles, sight: float) -> None:
+        """Drop each hypothesis that is farther than `sight`, plus its standard deviation, from all `places` (N, 2):
+        no ground of the map is in view there, so an aircraft at this position is lost."""
+        now = self._now
+        if not len(now.weight):
+            return
+        distance = np.nanmin(compute_distances(now.position, places), axis=1)
+        is_in_sight = distance <= sight + np.sqrt(np.trace(now.covariance, axis1=1, axis2=2) / 2)
+        self._now = now[np.flatnonzero(is_in_sight)]
+        self._lost = max(0.0, 1 - float(self._now.weight.sum()))
+
     def update(self, proposed: Proposals | None, motion: Motion, places: int) -> Posterior:
         """Update the belief with the candidates that a query proposes (None: too little texture in its picture; those
         that are not finite are ignored), the motion since the previous query, and the number of places in the map."""
@@ -158,6 +171,7 @@ class Belief:
         now, lost, arrival = self._apply_transitions()
         moves = self._predict_motions(now, motion, places)
         probability = np.zeros(0 if proposed is None else len(proposed.probability))
+        predicted = np.zeros_like(probability)
         indices: Ints = np.zeros(0, int)
         if proposed is None:
             lost += arrival  # an aircraft that enters the map now is at an unknown place
@@ -169,6 +183,7 @@ class Belief:
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
             misses = _predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
+            predicted[indices] = self._compute_mass_near(replace(misses, weight=now.weight), proposed.position)
             # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
             min_gain = (factor * odds * lost - float(misses.weight.sum())) / max(float(hits.weight.sum()), _MIN_WEIGHT)
             hits = replace(hits, weight=hits.weight * max(1.0, min_gain) ** staleness)
@@ -179,7 +194,13 @@ class Belief:
         strongest = np.argsort(-weight, kind="stable")[:_MAX_HYPOTHESES]
         self._now = replace(updated, weight=weight)[strongest[weight[strongest] > _MIN_WEIGHT]]
         self._lost = max(0.0, 1 - float(self._now.weight.sum()))
-        return self._make_posterior(probability)
+        return self._make_posterior(probability, predicted)
+
+    def _compute_mass_near(self, moved: _Hypotheses, position: Doubles) -> Doubles:
+        """Return the weight (K,) of the hypotheses near each `position` (K, 2), allowing for their covariance."""
+        sd = np.sqrt(np.trace(moved.covariance, axis1=1, axis2=2) / 2)
+        is_near = compute_distances(position, moved.position) <= self._scale.near + _SAME_POSITION_SIGMAS * sd
+        return np.asarray(is_near @ moved.weight)
 
     def _apply_transitions(self) -> tuple[_Hypotheses, float, float]:
         """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the
@@ -283,12 +304,12 @@ class Belief:
         )
         return hypotheses, likelihood, staleness, odds_factor
 
-    def _make_posterior(self, probability: Doubles) -> Posterior:
+    def _make_posterior(self, probability: Doubles, predicted: Doubles) -> Posterior:
         """Return the belief with an estimate: the weighted mean of the hypotheses around the one whose
         neighbourhood has the most weight."""
         now = self._now
         if not len(now.weight):
-            return Posterior(lost=self._lost, probability=probability)
+            return Posterior(lost=self._lost, probability=probability, predicted=predicted)
         is_near = compute_distances(now.position, now.position) <= self._scale.near
         chosen = is_near[(is_near @ now.weight).argmax()]
         mass = float(now.weight[chosen].sum())
@@ -296,8 +317,8 @@ class Belief:
         (position,), (covariance,) = mix_gaussians(weight[None], now.position[chosen], now.covariance[chosen])
         north, east = (weight @ now.heading[chosen]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
-        estimate = Posterior(lost=self._lost, probability=probability, mass=mass, position=position)
-        return replace(estimate, covariance=covariance, heading_deg=heading_deg)
+        estimate = Posterior(lost=self._lost, probability=probability, predicted=predicted, mass=mass)
+        return replace(estimate, position=position, covariance=covariance, heading_deg=heading_deg)
 
 
 def _predict_misses(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:

@@ -214,11 +214,14 @@ class Decider:
         best, findings = self._gather_findings(ranking, query, verifier)
         if place_filter and confidence_rule and findings.evidence:
             with self.meter.step("locate"):
-                track = place_filter.update(ranking, index, findings.evidence, confidence_rule, findings.located)
+                track = place_filter.update(
+                    ranking, index, findings.evidence, confidence_rule, findings.located, query.view
+                )
             if track.slot is not None and track.prefers_other(int(ranking.slots[0])):
                 ranking = ranking.promote(track.slot)
                 best, findings = self._gather_findings(ranking, query, verifier)
-        findings = replace(findings, track_confidence=track.confidence if track else None)
+        if track:
+            findings = replace(findings, track_confidence=track.confidence, predicted=track.predicted)
         verdict = judge(findings, index, rule, search)
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg

@@ -61,6 +61,9 @@ _MIN_TRACK_CONFIDENCE = 0.99
 _MIN_ODDS_RATIO = 10.0
 _MAX_TILT_SHOWN_DEG = 60.0  # if not recorded; a smaller tilt adds to the reported error (kite_ochota sways by 20)
 _MIN_TRACK_SUPPORT = 0.5  # least probability from the flight so far, for a confident match
+# Least probability, before the query, of the place of a match that only the flight so far makes acceptable: ground
+# outside the map that resembles a place once often does so again a few queries later.
+_MIN_PREDICTED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +129,10 @@ class Findings:
     `agreement`: that of the landmarks of query and place (None: not compared). `located`: the position computed from
     the best places (None: only that of the best place is known); these places do not count as elsewhere.
     `evidence`: that of the match (None: the rule needs none). `track_confidence`: probability of the place from the
-    flight so far (None: the query is judged alone). `lead_over_other_rotation`: the lead, as in the evidence, over the
-    same place with the picture at another rotation (None: not compared). `unshifted_fraction`: the fraction of a few
-    places elsewhere that are unshifted, if the best one is too (else 0). `tilt`: tilt of the query relative to the
-    place (None: not measured).
+    flight so far, `predicted` before this query (None: the query is judged alone). `lead_over_other_rotation`: the
+    lead, as in the evidence, over the same place with the picture at another rotation (None: not compared).
+    `unshifted_fraction`: the fraction of a few places elsewhere that are unshifted, if the best one is too (else 0).
+    `tilt`: tilt of the query relative to the place (None: not measured).
     """
 
     ranking: Ranking = field(kw_only=False)
@@ -137,6 +140,7 @@ class Findings:
     located: Located | None = None
     evidence: Evidence | None = None
     track_confidence: float | None = None
+    predicted: float | None = None
     lead_over_other_rotation: float | None = None
     unshifted_fraction: float = 0.0
     tilt: ObservedTilt | None = None
@@ -242,7 +246,10 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     figures = {"track_confidence": track, "confidence": reported, "min_confidence": needed, **evidence.describe()}
     is_confident = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
-    if not (is_confident or (track is not None and _is_track_confident(track, confidence, needed, rule.precision))):
+    is_predicted = findings.predicted is not None and findings.predicted >= _MIN_PREDICTED
+    if not (
+        is_confident or (track and is_predicted and _is_track_confident(track, confidence, needed, rule.precision))
+    ):
         code = ReasonCode.LOW_CONFIDENCE
     elif evidence.lead < 0 and not is_confident:
         code = ReasonCode.ELSEWHERE_AGREES_BETTER

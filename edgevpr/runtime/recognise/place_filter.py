@@ -13,6 +13,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.core.geodesy import move_position, offset_between_m, offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
+from edgevpr.frames.level import View
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
@@ -40,12 +41,13 @@ _MIN_SPACING_M = 5.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackEstimate:
     """Result of a query combined with the flight so far. `slot` is the index row of the most likely place (None: no
-    place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is at no
-    position of the belief. `estimate` is its most likely position (None: unknown, or the map has no positions), and
-    `mass` the probability that it is near this position."""
+    place), `confidence` the probability that the aircraft is there, and `predicted` that before the query. `lost` is
+    the probability that it is at no position of the belief. `estimate` is its most likely position (None: unknown, or
+    the map has no positions), and `mass` the probability that it is near this position."""
 
     slot: int | None
     confidence: float
+    predicted: float
     lost: float
     mass: float
     estimate: Located | None
@@ -57,22 +59,31 @@ class TrackEstimate:
 
 class _MapGeometry:
     """Measures of a map: the `origin` of the belief's plane (None: the map has no positions), the
-    `scale`, and `spread`, the standard deviation of the position of a place without a pose."""
+    `scale`, `spread`, the standard deviation of the position of a place without a pose, and `footprint_m`, the largest
+    one of its places (None: unknown)."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
-        self.origin = None
+        self.origin = self.footprint_m = None
         self.scale, self.spread = MapScale(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True), 1.0
         if known.mean() > _MIN_MAJORITY:
             first = int(np.flatnonzero(known)[0])
             self.origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
-            spacing_m, footprint_m = index.spacing_m() or 0.0, read_layers(place_map).median_m
+            layers = read_layers(place_map)
+            self.footprint_m = max(layers.footprints_m, default=None)
+            spacing_m, footprint_m = index.spacing_m() or 0.0, layers.median_m
             self.spread = max(_MIN_SPACING_M, spacing_m)
             near_m = _NEAR_FOOTPRINT * footprint_m if footprint_m else self.spread
             self.scale = MapScale(
                 spacing=max(_MIN_SPACING_M, footprint_m / 2 if footprint_m else spacing_m),
                 near=max(_MIN_SPACING_M, near_m),
             )
+
+    def find_sight_m(self, view: View) -> float | None:
+        """Return the farthest distance of the aircraft from a place that shares ground with a picture; None: unknown"""
+        if not (self.footprint_m and view.footprint_m and view.nadir_offset):
+            return None
+        return self.footprint_m / 2 + view.footprint_m * (0.5 + math.hypot(*view.nadir_offset))
 
     def positions(self, slots: Ints, index: PlaceIndex) -> Doubles:
         """Return positions in the plane of the belief, float (K, 2); NaN if unknown."""
@@ -114,22 +125,31 @@ class PlaceFilter:
         self._odometry = odometry if odometry and odometry.from_s == before_s else None
 
     def update(
-        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, rule: ConfidenceRule, located: Located | None
+        self,
+        ranking: Ranking,
+        index: PlaceIndex,
+        evidence: Evidence,
+        rule: ConfidenceRule,
+        located: Located | None,
+        view: View,
     ) -> TrackEstimate:
         """Return the result of one pass combined with the flight so far; nothing is kept until `commit`. `evidence` is
         that of the best place in the `ranking`, and `rule` converts it to probabilities. `located` is the position of
-        the aircraft computed from the best place (None: the position of the place itself is used)."""
+        the aircraft computed from the best place (None: the position of the place itself is used), and `view` is that
+        of the query."""
         if self._geometry is None or self._belief is None:
             self._geometry = _MapGeometry(self._map, index)
             self._belief = Belief(self._geometry.scale)
         geometry, near = self._geometry, self._geometry.scale.near
         slots, proposed = _make_proposals(ranking, index, geometry, rule, evidence, located)
         self._next = copy.copy(self._belief)
+        if (sight_m := geometry.find_sight_m(view)) is not None:
+            self._next.drop_off_map(geometry.positions(np.arange(len(index)), index), sight_m)
         posterior = self._next.update(proposed, self._make_motion(geometry), len(index))
-        slot, confidence = None, 0.0
+        slot, confidence, predicted = None, 0.0, 0.0
         if len(slots) and posterior.probability.max() > 0:
             best = int(posterior.probability.argmax())
-            slot, best_position = int(slots[best]), proposed.position[best]
+            slot, best_position, predicted = int(slots[best]), proposed.position[best], float(posterior.predicted[best])
             is_near = np.hypot(*(proposed.position - best_position).T) <= near
             confidence = float(posterior.probability[is_near].sum())
             if confidence > _MIN_MAJORITY and np.hypot(*(posterior.position - best_position)) <= near:
@@ -142,7 +162,12 @@ class PlaceFilter:
             covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
         return TrackEstimate(
-            slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate
+            slot=slot,
+            confidence=confidence,
+            predicted=predicted,
+            lost=posterior.lost,
+            mass=posterior.mass,
+            estimate=estimate,
         )
 
     def update_without_match(self, index: PlaceIndex) -> None:

@@ -91,6 +91,23 @@ def test_update_refuses_foreign_ground_that_resembles_the_map_slightly(p, places
     assert max(masses) < CERTAIN
 
 
+def test_update_predicts_the_place_that_earlier_queries_lead_to():
+    belief = Belief(ORDER_SCALE)
+    assert belief.update(make_evidence([50], [0.9]), STEP, PLACES).predicted == pytest.approx([0.0])
+    near, far = belief.update(make_evidence([51, 80], [0.4, 0.4]), STEP, PLACES).predicted
+    assert near > 0.85
+    assert far == 0
+
+
+@pytest.mark.parametrize(("distance_m", "is_lost"), [(40.0, False), (120.0, True)])
+def test_drop_off_map_makes_an_aircraft_lost_where_no_place_is_in_sight(distance_m, is_lost):
+    belief = Belief(METRIC_SCALE)
+    belief.update(make_evidence([[0.0, 0.0]], [0.99], sd=5.0), make_motion(1.0, 30.0), PLACES)
+    belief.drop_off_map(np.array([[distance_m, 0.0], [np.nan, np.nan]]), sight=100.0)
+    lost = belief.update(None, make_motion(1.0, 30.0), PLACES).lost
+    assert lost == pytest.approx(1.0) if is_lost else lost < 0.1
+
+
 def fly_over(track_m, belief, odometry, p=0.8):
     """Fly over a track (N, 2) in metres; `odometry` makes what it reports from each true step."""
     posteriors = []

@@ -32,12 +32,12 @@ from edgevpr.techniques import create
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
 
 
-def decide(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
+def decide(scores=(0.2, 0.1), rule=RULE, matches=None, predicted=1.0, **more):
     """The verdict on a best place and places elsewhere with these scores; `more` is known of the best."""
     slots = np.array([0, 10, 20])[: len(scores)]
     compared = dict(zip(slots.tolist(), matches or map(FineMatch, scores), strict=True))
     ranking = Ranking(slots=slots, scores=np.array(scores, np.float32), compared=compared)
-    return judge(Findings(ranking, **more), make_bare_index(30), rule)
+    return judge(Findings(ranking, predicted=predicted, **more), make_bare_index(30), rule)
 
 
 CLEAR = Evidence(agree=-1.6, lead=0.7, coverage=-0.5)
@@ -100,6 +100,13 @@ def test_judge_requires_only_the_precision_if_the_track_makes_the_place_much_lik
     rule = make_rule(lambda evidence: confidence, needed=0.9999)
     assert decide(rule=rule, evidence=CLEAR, track_confidence=followed).accepted == accepted
     assert decide(rule=rule, evidence=CLEAR).accepted is (confidence == 1.0)
+
+
+@pytest.mark.parametrize(("predicted", "accepted"), [(0.5, True), (0.49, False), (None, False)])
+def test_judge_lets_the_track_decide_only_where_it_predicted_the_place(predicted, accepted):
+    track = {"track_confidence": 0.9999, "predicted": predicted}
+    assert decide(rule=make_rule(lambda evidence: 0.5), evidence=CLEAR, **track).accepted is accepted
+    assert decide(rule=make_rule(lambda evidence: 1.0), evidence=CLEAR, **track).accepted, "it needs no track"
 
 
 @pytest.mark.parametrize(("followed", "accepted"), [(0.99, True), (0.9899, False)])

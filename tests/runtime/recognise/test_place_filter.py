@@ -10,6 +10,7 @@ from sureness import make_model
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position
 from edgevpr.core.types import Frame, Pose, Position
+from edgevpr.frames.level import View
 from edgevpr.places.index import PlaceIndex, allocate_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
@@ -24,6 +25,7 @@ SPACING_M = 20.0
 FOOTPRINT_M = 80.0
 STRIDE = 3  # places from look to look, at one a second: each look is of new ground
 SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
+VIEW = View(up_deg=0.0, footprint_m=FOOTPRINT_M, nadir_offset=(0.0, 0.1))
 BLANK = np.zeros((4, 4), np.uint8)
 CERTAIN = 0.98
 STEP_M = 0.6 * SPACING_M * STRIDE, 0.8 * SPACING_M * STRIDE
@@ -80,7 +82,7 @@ class Flight:
                 position=to_position(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,)
             )
         return self.follower.update(
-            Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where
+            Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where, VIEW
         )
 
     def query(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
@@ -181,9 +183,18 @@ def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(pos
     )
     follower = PlaceFilter(posed_map, max_speed_m_s=None, is_live=True)
     rule = make_model(lambda evidence: 0.6, lambda evidence: 0.9)
-    followed = follower.update(ranking, METRIC_INDEX, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), rule, where)
+    followed = follower.update(ranking, METRIC_INDEX, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), rule, where, VIEW)
     assert (followed.slot, followed.confidence) == (20, pytest.approx(0.6))
     assert followed.lost == pytest.approx(0.4)
+
+
+def test_place_filter_is_lost_beyond_the_map(posed_map):
+    flight = Flight(posed_map, METRIC_INDEX)
+    flight.over(range(10, 40, STRIDE))
+    east_m, north_m = 0.8 * SPACING_M * STRIDE, -0.6 * SPACING_M * STRIDE  # across the row of places
+    found = [flight.query(80, 0.01, moved_m=(east_m, north_m), velocity_m_s=(0.0, 0.0)) for _ in range(4)]
+    assert found[0].lost < 0.6
+    assert found[3].lost > 0.95
 
 
 @pytest.mark.parametrize("t_utc_s", [None, float("nan")])
