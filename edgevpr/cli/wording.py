@@ -60,8 +60,7 @@ def format_build(path: str, built_map: "BuiltMap", from_orthophoto: bool) -> Ite
 
 
 def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
-    """Yield the result of refining a map: how many places were moved to the true position of their picture, by how
-    much, and which were recorded far from it."""
+    """Yield the result of refining a map."""
     if refined.without_position == refined.places:
         yield "  not refined: no place has a position"
         return

@@ -40,8 +40,7 @@ _MAX_SIDE_PX = 1024  # longest side of a warped image: no technique uses more pi
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Fixed angles of the camera from straight down, forward and to the right, relative to the airframe or gimbal
-    (negative: backward, to the left)."""
+    """Fixed angles of the camera from straight down, forward and to the right, relative to airframe or gimbal."""
 
     ahead_deg: float = 0.0
     right_deg: float = 0.0

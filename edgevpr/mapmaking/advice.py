@@ -1,5 +1,4 @@
-"""Checks the pictures of a flight before a map is made from them: where the camera points, whether an on-screen display
-covers part of the pictures, and what the map will lack.
+"""Checks pictures before a map is made: where the camera points, on-screen displays, and what the map will lack.
 
 From one picture of a forward camera to the next, the scene grows, but neither rotates nor moves up or down. With a
 camera that looks straight down, it moves in any direction and rotates. Landmarks of a few neighbouring pairs show this.

@@ -1,5 +1,4 @@
-"""Alters pictures as if taken on another day, in another season, from another height and on another course. `calibrate`
-makes its queries from the map's own pictures this way.
+"""Alters pictures as if taken on another day, in another season, from another height and on another course.
 
 No single change is realistic. Together they reduce the fraction of agreeing regions as much as real changes do, so that
 correct and wrong matches are as hard to distinguish as in flight. `strength`: from about 0 (hardly any change) to 1.3.
@@ -43,8 +42,7 @@ def change_picture(
 
 
 def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
-    """Return a random pixel homography, (3, 3), that alters a picture of this `shape` like a different position,
-    height, course and tilt of the camera."""
+    """Return a random pixel homography, (3, 3), like a change of position, height, course and tilt of the camera."""
     height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
     turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength

@@ -16,9 +16,8 @@ from edgevpr.runtime.flight.flightlog import select_last_flight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapMove:
-    """A move of a map with `places` places. Its centre `middle` (latitude and longitude in degrees) moves by `east_m`
-    and `north_m`, with a standard deviation of `sd_m`. Distances from the centre are divided by 1 + `scale` (None: the
-    flight could not measure the scale, so they are unchanged)."""
+    """A move of a map of `places` places. Its centre `middle` (latitude and longitude in degrees) moves by `east_m` and
+    `north_m`, standard deviation `sd_m`. Distances from it are divided by 1 + `scale` (None: unchanged)."""
 
     places: int
     middle: tuple[float, float]

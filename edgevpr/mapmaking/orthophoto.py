@@ -1,5 +1,4 @@
-"""Cuts square pictures of the ground out of an orthophoto, with sides in metres and true north up. `orthophoto_source`
-makes the frames of a map from them."""
+"""Cuts square pictures of the ground out of an orthophoto, with sides in metres and true north up."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,5 +1,4 @@
-"""Channels: the messages that carry positions to an autopilot. Its parameters determine the channel: see
-`ardupilot_parameters` and `px4_parameters`."""
+"""Channels: the messages that carry positions to an autopilot. Its parameters determine the channel."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -132,8 +132,7 @@ def merge_maps(
 def _add_places(
     place_map: PlaceMap, source: PlaceMap, progress: Progress, only: Collection[int] | None
 ) -> tuple[int, int]:
-    """Copy the places of `source`, or those with the ids `only`, into `place_map`, except for duplicates. Return the
-    number of places copied and the number of duplicates."""
+    """Copy the places `only` (None: all) of `source` into `place_map`; return the numbers of copies and duplicates."""
     copied = duplicates = 0
     with place_map.transaction():
         ids_by_picture = place_map.select_ids("source_image, time")

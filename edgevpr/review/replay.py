@@ -1,5 +1,4 @@
-"""Replays a recorded flight, for `edgevpr replay`: runs the flight code with clocks, frames and messages from the
-recording instead of the real ones."""
+"""Replays a recorded flight, for `edgevpr replay`: runs its code with clocks, frames and messages of the recording."""
 
 import logging
 from collections.abc import Iterator
@@ -99,8 +98,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
 
 @contextmanager
 def _silence_log() -> Iterator[None]:
-    """Context manager that suppresses the messages of the replayed flight except errors, because they were printed in
-    the flight; with --debug it suppresses none."""
+    """Context manager that suppresses messages of the replayed flight except errors (with --debug: none)."""
     logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
     try:
         yield

@@ -87,8 +87,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 
 def _find_factory(name: str) -> Callable[..., Any]:
-    """Return the class or function that creates the technique `name`; its arguments are the technique's parameters.
-    Raises the errors of `read_parameters`."""
+    """Return what creates the technique `name` from its parameters. Raises the errors of `read_parameters`."""
     if name in _FACTORIES:
         factory: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_FACTORIES[name]}")
         return factory

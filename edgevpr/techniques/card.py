@@ -102,8 +102,7 @@ def compute_digest(values: list[Any]) -> str:
 
 
 def _drop_unused_keys(part: InputRule | Outputs) -> dict[str, Any]:
-    """Return a section of a card as a dict, without unused keys that later versions added, so that the card's
-    fingerprint is the same in all versions."""
+    """Return a section as a dict, without unused keys that later versions added: the fingerprint stays the same."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _KEYS_ADDED_LATER}
 
 

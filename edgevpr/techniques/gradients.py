@@ -1,5 +1,4 @@
-"""Histograms of oriented gradients over cells and blocks, for `hog`, `cohog` and the training of CALC, and the
-low-frequency ("slow") patterns of blocks.
+"""Histograms of oriented gradients over cells and blocks, and the low-frequency ("slow") patterns of blocks.
 
 A map made on one processor may be used on another, so results must be rounded identically on all of them: products,
 sums and roots are computed one by one. The rounding of OpenCV's fused operations and matrix products differs.

@@ -1,5 +1,4 @@
-"""Base class of the techniques that describe an image by one vector: the vector's three forms in RAM, and the
-comparison. `hog`, also here, needs no network.
+"""Base class of the techniques that describe an image by one vector, with three forms in RAM; and `hog`.
 
 The map file and the form `float` store half precision. `8bit` and `1bit` subtract the mean of all vectors in the map,
 which all places have in common, and store one byte or one bit per value."""

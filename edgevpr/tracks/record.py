@@ -1,5 +1,4 @@
-"""Recordings of an aircraft's path: autopilot logs, subtitles of drone videos, receiver tracks, and tables from other
-programs. `read_record` detects the type of a file."""
+"""Recordings of an aircraft's path: autopilot logs, subtitles of drone videos, tracks, and tables of other programs."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field

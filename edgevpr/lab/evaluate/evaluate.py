@@ -1,5 +1,4 @@
-"""Measures one technique on a data set: maps the references, runs every query as in flight, judges each answer by the
-ground truth, and summarises quality and cost.
+"""Measures a technique on a data set: maps the references, runs queries as in flight, judges and sums up the answers.
 
 Numbers in parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Place Recognition for
 Autonomous Robots*).
@@ -249,8 +248,7 @@ def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
 
 
 def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:
-    """Judge the recognition of `query`. `references` are the names of all places, in mapping order, which is also the
-    order of the slots of the index."""
+    """Judge the recognition of `query`. `references`: names of all places, in mapping order, as in the index."""
     discarded = event.salience is not None and event.salience.reason is not None
     ranking = None if discarded else event.ranking
     slots = ranking.slots if ranking else np.empty(0, np.intp)

@@ -1,5 +1,4 @@
-"""Renders pictures of a scene by a camera under a drone: lighting, a pinhole camera and its sensor's imperfections.
-`generated` and `overflight` take their pictures with it."""
+"""Renders pictures of a scene by a camera under a drone: lighting, a pinhole camera and its sensor's imperfections."""
 
 from dataclasses import dataclass
 

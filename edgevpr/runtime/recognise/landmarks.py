@@ -1,5 +1,4 @@
-"""Landmarks of an image: points that can be found again in another image of the same ground, each described by 256
-bits. `agreement` compares those of query and place.
+"""Landmarks of an image: points that can be found again in other images of the same ground, described by 256 bits.
 
 The points are FAST corners and the bits are ORB descriptors (Rublee et al. 2011). A place keeps few of them, spread
 over the image. A query has more, so that most of the place's visible points are among them.

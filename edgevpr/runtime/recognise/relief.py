@@ -1,5 +1,4 @@
-"""Estimates how much the height of the ground varies, for positions from tilted images: their centre shows ground
-higher or lower than that below the aircraft."""
+"""Estimates how much the height of the ground varies, which shifts positions from tilted images."""
 
 import math
 
