@@ -135,7 +135,7 @@ def test_send_fix_is_answered_or_dropped_and_link_reports_the_vehicle(link):
 
 
 @pytest.mark.parametrize("kind", ["real", "fake"])
-def test_link_announces_texts_and_hands_on_wishes(kind):
+def test_link_announces_texts_and_returns_commands(kind):
     clock, port = FakeClock(), UdpPort()
     link = FakeLink(clock)
     if kind == "real":

@@ -9,7 +9,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.techniques import create
 
 
-def test_flight_from_pictures_to_a_fix(tmp_path):
+def test_flight_sends_a_fix_for_a_recognised_image(tmp_path):
     frames = [
         Frame(image=draw_texture(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
     ]

@@ -54,7 +54,7 @@ def test_reason_sentence_omits_unknown_parameters(code, parameters, sentence):
     assert str(Reason(codes[code], parameters)) == sentence
 
 
-def test_codes_are_all_different():
+def test_reason_codes_are_all_different():
     names = [name for table in TABLES.values() for name in table.__members__]
     assert len(set(names)) == len(names) == len(CODES), "members with equal texts would be one"
 

@@ -35,7 +35,7 @@ def rows():
 
 
 @pytest.mark.parametrize("stream", WHOLE)
-def test_whole_stream_loses_nothing(stream, rows):
+def test_undamaged_stream_loses_no_image(stream, rows):
     whole = rows[stream]
     late = whole.refused["late"]  # those that waited for the opening, and what a busy machine is too slow for
     assert (whole.old, whole.broken) == (0, 0)

@@ -75,7 +75,7 @@ def test_read_exif_treats_an_implausible_position_as_unknown(gps, tmp_path):
         (None, {TAKEN: "    :  :     :  :  "}, None),
     ],
 )
-def test_read_exif_time(gps, camera, t_utc_s, tmp_path):
+def test_read_exif_reads_the_time_of_each_source(gps, camera, t_utc_s, tmp_path):
     assert read_tag(tmp_path, gps, camera=camera).t_utc_s == t_utc_s
 
 

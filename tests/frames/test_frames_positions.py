@@ -52,7 +52,7 @@ def write_table(tmp_path):
         ),
     ],
 )
-def test_read_positions(text, tags, write_table):
+def test_read_positions_reads_each_column(text, tags, write_table):
     assert read_positions(write_table(text, "utf-8-sig")) == tags
 
 
@@ -68,7 +68,7 @@ def test_read_positions(text, tags, write_table):
         "1466699519.0",
     ],
 )
-def test_parse_time(text):
+def test_parse_time_reads_each_format(text):
     assert parse_time(text) == 1466699519
 
 
@@ -76,7 +76,7 @@ def test_parse_time(text):
     "text",
     ["", "yesterday", "nan", "-inf", "2016:13:23 16:31:59", "2016:06:23 25:00:00", "1466699519000", "1e308", "-1e10"],
 )
-def test_parse_time_refuses(text):
+def test_parse_time_refuses_other_text(text):
     with pytest.raises(ValueError):
         parse_time(text)
 

@@ -87,7 +87,7 @@ def test_fixes_may_affect_the_position_unless_refused(fixes):
     assert fixes.t_fix_s == 15.0
 
 
-def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_stop():
+def test_fixes_lost_with_the_port_await_no_answer_and_end_no_stop():
     reports = []
     fixes = Fixes(announce=lambda *report: reports.append(report))
     send(fixes, 0, 1, 2, 3, 4)

@@ -132,7 +132,7 @@ def test_align_finds_shift_rotation_and_scale_despite_outliers(shift, turn_deg, 
     assert found.height_ratio == pytest.approx(2 * scale, abs=0.03)
 
 
-def test_covariance_comes_from_the_residuals_of_pairs():
+def test_fit_alignment_takes_the_covariance_from_residuals():
     exact = align(*make_pairs((0.0, 0.0), 0.0, 1.0), shift_cells=(0.0, 0.0))
     assert exact.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
     mixed = align(*make_pairs((0.0, 0.0), 0.0, 1.0, wrong=0.8), shift_cells=(0.0, 0.0))

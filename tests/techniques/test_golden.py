@@ -13,17 +13,17 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_filled_bins_is_the_printed_algorithm(seed):
+def test_compute_filled_bins_equals_the_printed_algorithm(seed):
     image = draw_texture(seed, 70, 45)
     np.testing.assert_allclose(entropy.compute_filled_bins(image), literal.filled_bins(image), atol=1e-6)
 
 
-def test_filled_bins_of_radius_5_tops_out_below_one():
+def test_compute_filled_bins_stays_below_one_at_radius_5():
     all_different = np.add.outer(11 * np.arange(20), np.arange(20)).astype(np.uint8)  # in any 11x11 pixels
     assert entropy.compute_filled_bins(all_different).max() == pytest.approx(np.log2(81) / 8, abs=1e-6)
 
 
-def test_shannon_entropy_equals_that_of_the_disc():
+def test_compute_shannon_equals_the_entropy_of_each_disc():
     image = draw_texture(4, 128, 128)
     np.testing.assert_allclose(entropy.compute_shannon(image), literal.shannon(image), atol=1e-5)
 

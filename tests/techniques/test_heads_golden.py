@@ -47,7 +47,7 @@ def test_make_gaussian_row_is_reproducible():
 
 
 @pytest.mark.parametrize("shape", [(15, 20), (13, 13), (20, 15), (7, 30), (2, 2), (4, 5)])
-def test_rmac_regions(shape):
+def test_make_square_regions_equals_the_literal_loop(shape):
     found = regions.make_square_regions(*shape)
     assert found == literal.rmac_regions(*shape)
     for top, left, side in found:
@@ -56,7 +56,7 @@ def test_rmac_regions(shape):
         assert left + side <= shape[1]
 
 
-def test_rmac_vectors_and_aggregate():
+def test_pool_squares_equals_the_literal_loop():
     where = regions.make_square_regions(7, 9)
     vectors = regions.pool_squares(SIGNED, where)
     np.testing.assert_allclose(vectors, literal.rmac_vectors(SIGNED, where), rtol=1e-5, atol=1e-6)
@@ -88,7 +88,7 @@ def test_compute_sharpness_weights_a_word_a_hundred_times_the_next():
 
 
 @pytest.mark.parametrize(("dead", "count"), [(0.6, 12), (0.6, 10_000), (0.9, 30), (1.0, 10)])
-def test_regions_are_the_most_energetic_connected_activations(dead, count):
+def test_find_regions_returns_the_most_energetic_connected_activations(dead, count):
     features = make_feature_map(7, channels=5, dead=dead)
     boxes = regions.find_regions(features, count)
     expected = literal.regions(features, count)

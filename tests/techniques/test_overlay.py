@@ -96,7 +96,7 @@ def test_match_of_changed_ground_is_prominent():
     assert matches[0].rotation_deg == pytest.approx(33, abs=3)
 
 
-def test_ahead_the_structures_weigh_the_score():
+def test_forward_score_is_weighted_by_the_structures():
     technique = CoHog()
     seen = [np.dstack([draw_view(make_ground(seed))] * 3).astype(np.uint8) for seed in (0, 1)]
     places, query = [technique.encode(picture) for picture in seen], technique.encode(seen[0])

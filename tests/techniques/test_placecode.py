@@ -53,7 +53,7 @@ def test_make_grid_ignores_masked_blocks(town):
     assert abs(asked).sum(axis=1).max() == 1152 / 2
 
 
-def test_scan_codes_is_the_product_spelt_out(town):
+def test_scan_codes_equals_the_literal_product(town):
     _, mean, _ = town
     rng = np.random.default_rng(1)
     codes = rng.integers(0, 256, (600, 144), dtype=np.uint8)  # a whole block of places and a part

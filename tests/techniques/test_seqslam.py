@@ -61,7 +61,7 @@ def test_encode_ignores_light_and_contrast_and_marks_flat_patches():
     assert (flat.coarse.reshape(32, 64)[:8, :16] == 128).all()
 
 
-def test_scores_are_the_enhanced_mean_absolute_differences_of_the_paper():
+def test_score_places_equals_the_enhanced_differences_of_the_paper():
     technique = SeqSlam()
     rows = encode_rows(technique, 40)
     query = technique.encode(cv2.convertScaleAbs(draw_texture(17), alpha=0.7))

@@ -152,7 +152,7 @@ def test_run_orders_colours_as_in_the_card():
     assert prepare_input(image[..., 0], make_rule(colour="rgb", scale=1.0))[0, :, 0, 0].tolist() == [10, 10, 10]
 
 
-def test_scale_mean_and_deviation_in_this_order():
+def test_prepare_input_applies_scale_mean_and_deviation_in_this_order():
     image = np.full((12, 16, 3), 51, np.uint8)
     it = make_rule(colour="rgb", mean=[0.1, 0.2, 0.3], std=[0.5, 1.0, 2.0])
     np.testing.assert_allclose(prepare_input(image, it)[0, :, 5, 5], [0.2, 0.0, -0.05], atol=1e-6)

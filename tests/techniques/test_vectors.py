@@ -55,7 +55,7 @@ def literal_score(form, similarity, query, place, mean):
 
 @pytest.mark.parametrize("similarity", ["cosine", "l1"])
 @pytest.mark.parametrize("form", FORMS)
-def test_scores_are_those_of_a_literal_loop(form, similarity):
+def test_score_places_equals_the_literal_loop(form, similarity):
     technique, coarse, mean, rows = make_rows(form, similarity, make_vectors())
     query = technique.encode(make_vectors(1, seed=5)[0])
     scores, hypotheses = technique.score_places(query, rows, mean)

@@ -134,7 +134,7 @@ def test_read_record_reads_each_subtitle_format(tmp_path, form):
         ("\ufefffile\tVehicle Latitude [deg]\tVehicle Longitude [deg]\na.JPG\t50.25 N\t8.5 E\n", (50.25, 8.5, None)),
     ],
 )  # fmt: skip
-def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expected):
+def test_read_record_reads_tables_of_other_programs(tmp_path, text, expected):
     (tmp_path / "table.csv").write_text(text)
     record = read_record(tmp_path / "table.csv")
     at = record.tags_by_name["a.JPG"].position

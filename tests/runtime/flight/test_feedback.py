@@ -37,7 +37,7 @@ def test_loop_is_stable_for_each_claimed_accuracy(min_accuracy_m, gyro_sd, show_
 
 
 @pytest.mark.parametrize("min_accuracy_m", [0.1, 1.0])
-def test_claims_as_accurate_as_the_matches_fail_without_tilt_measurements(min_accuracy_m, monkeypatch):
+def test_loop_diverges_if_claims_equal_match_accuracy_and_tilt_is_not_measured(min_accuracy_m, monkeypatch):
     """And with gyros that are taken to be as good as they are. This is how a PX4 was lost within a minute."""
     monkeypatch.setattr(navigator, "CORRELATION_FACTOR", 1.0)
     monkeypatch.setattr(navigator, "INERTIAL_PX4", replace(drift.INERTIAL, acceleration_noise=0.02))

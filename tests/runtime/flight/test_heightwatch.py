@@ -38,7 +38,7 @@ def watch(notifier, clock, link):
     return Watch(notifier, clock, link)
 
 
-def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
+def test_height_watch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
     assert watch.update(150, 160, 158, 162) == []
     assert watch.watch.ratio == 1.0
     assert watch.update(155) == [format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=100.0, image_height_m=158.0)]
@@ -63,14 +63,14 @@ def test_ratio_sd_is_the_deviation_of_the_newest_match(watch):
     assert (watch.watch.ratio, watch.watch.ratio_sd) == (pytest.approx(1.41), 0.0)
 
 
-def test_heightwatch_bears_a_reported_height_of_zero(watch):
+def test_height_watch_accepts_a_reported_height_of_zero(watch):
     assert watch.update(*[100] * 5, reported_m=0.0) == [
         format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=1.0, image_height_m=100.0)
     ]
     assert watch.watch.ratio == 100.0
 
 
-def test_heightwatch_corrects_by_less_than_it_reports(watch):
+def test_height_watch_corrects_by_less_than_it_reports(watch):
     assert watch.update(*[115, 120, 118, 120]) == []
     assert watch.watch.ratio == 1.0
     assert watch.update(122) == []

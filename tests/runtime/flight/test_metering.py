@@ -51,7 +51,7 @@ def test_used_mah_of_a_flight_equals_the_closed_form(make_flight, clock):
     assert queries[-1]["totals"]["used_mah"] == pytest.approx(totals["used_mah"], rel=1e-6)
 
 
-def test_heat_is_logged_and_announced_and_figures_of_a_throttled_board_are_marked(make_flight, clock, link):
+def test_throttling_is_logged_and_announced_and_marks_the_figures(make_flight, clock, link):
     cool = ThermalState(temperature_c=61.0, frequency_mhz=1800.0, throttled=False, why="")
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     flight = make_flight("hog")

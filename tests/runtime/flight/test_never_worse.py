@@ -40,7 +40,7 @@ def assert_no_worse(vehicle, event, *, watched_s=WATCHED_S, **setup):
 
 @with_and_without_matches
 @pytest.mark.parametrize("satellites", [4, 5])
-def test_receiver_with_few_satellites_is_not_outbid(satellites, matches):
+def test_receiver_with_few_satellites_is_not_replaced_by_ours(satellites, matches):
     def lose_satellites(flight):
         flight.set("SIM_GPS1_NUMSATS", satellites)
 
@@ -67,7 +67,7 @@ def test_receiver_of_ours_does_not_diverge_while_used_with_gps(parameters, match
 
 
 @px4_channels
-def test_px4_is_on_gps_again_after_flight_over_lower_ground(parameters):
+def test_px4_uses_gps_again_after_flight_over_lower_ground(parameters):
     """Over ground that falls away, where strides are 1.4 times short: the position that is sent is 140 m off."""
     flight = ClosedLoop("px4-copter", matches=False, velocity_m_s=10j, **parameters).fly(SETTLED_S)
     flight.set("SIM_GPS1_ENABLE", 0)
@@ -100,7 +100,7 @@ def test_odometry_over_lower_ground_is_correct_once_matches_show_its_height():
 
 @px4_channels
 @pytest.mark.parametrize("map_off_m", [8, 20])
-def test_px4_is_on_gps_again_after_a_test_without(map_off_m, parameters):
+def test_px4_uses_gps_again_after_a_test_without_gps(map_off_m, parameters):
     def fly_without(flight):
         flight.map_off_m = map_off_m
         flight.set("EKF2_GPS_CTRL", 0).fly(20)
@@ -111,7 +111,7 @@ def test_px4_is_on_gps_again_after_a_test_without(map_off_m, parameters):
 
 @px4_channels
 @with_and_without_matches
-def test_px4_is_on_gps_again_after_receiver_is_flagged_as_spoofed(matches, parameters):
+def test_px4_uses_gps_again_after_a_receiver_was_flagged_as_spoofed(matches, parameters):
     def flag(flight):
         flight.set("SIM_GPS_SPOOF", 1).fly(20)
         flight.set("SIM_GPS_SPOOF", 0).fly(GPS_AGAIN_S)

@@ -219,7 +219,7 @@ def test_compose_overlays_leads_from_one_place_to_the_other():
     assert compose_overlays(one, replace(other, scale=None)).scale is None
 
 
-def test_step_and_turn_are_a_complex_step_and_logarithm():
+def test_relative_pose_is_a_complex_step_and_a_logarithm():
     assert Overlay((0.1, 0.2), 330.0, 1.5).relative_pose == pytest.approx(
         (0.1 - 0.2j, math.log(1.5) + 1j * math.pi / 6)
     )

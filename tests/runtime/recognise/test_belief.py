@@ -133,7 +133,7 @@ ODOMETRY_FAULTS = {
 
 @pytest.mark.parametrize("odometry", ODOMETRY_FAULTS.values(), ids=ODOMETRY_FAULTS)
 @pytest.mark.parametrize("speed_m", [5.0, 20.0, 40.0])
-def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
+def test_update_gains_from_odometry_and_is_not_misled_by_wrong_odometry(odometry, speed_m):
     track_m = speed_m * np.column_stack([np.arange(30), 0.3 * np.arange(30)])
     posteriors = fly_over(track_m, Belief(METRIC_SCALE), odometry)
     off_m = [np.hypot(*(each.position - at)) for each, at in zip(posteriors, track_m, strict=True)]

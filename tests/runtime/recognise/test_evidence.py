@@ -131,7 +131,7 @@ def test_gather_evidence_measures_the_lead_over_places_elsewhere_not_neighbours(
 
 
 @pytest.mark.parametrize(("inliers", "rival", "times"), [(32, 0, 4), (32, 16, 2), (32, 40, 1), (7, 3, 1), (0, 250, 1)])
-def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_and_by_chance(inliers, rival, times):
+def test_forward_landmarks_are_evidence_only_beyond_rivals_and_chance(inliers, rival, times):
     proof = log_inlier_ratio(inliers, rival)
     assert proof == pytest.approx(math.log(times))
     known = replace(see_forward({5: forward(0.2)}), proof=proof)

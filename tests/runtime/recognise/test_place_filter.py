@@ -262,7 +262,7 @@ def test_place_filter_counts_failed_queries_over_the_same_ground_once(posed_map)
 
 
 @pytest.mark.parametrize("moved_m", [None, measure_displacement_m(1)])
-def test_place_filter_recovers_from_a_wrong_belief(posed_map, moved_m):
+def test_place_filter_recovers_from_a_wrong_estimate(posed_map, moved_m):
     """Carried off by half the map, while the camera sees nothing of it, or sees a motion that is not the aircraft's."""
     flight, _ = fly_across_gap(posed_map, moved_m)
     found = [flight.query(place, p=0.9, moved_m=moved_m) for place in range(60, 66)]

@@ -41,7 +41,7 @@ def draw_texture(height=120, width=160, spread=40.0, middle=128.0):
     return np.clip(middle + spread * fine / fine.std(), 0, 255).astype(np.uint8)
 
 
-def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_nothing():
+def test_compute_scores_averages_the_whole_picture_with_masked_pixels_as_zero():
     picture = draw_texture()
     static = np.ones(picture.shape, bool)
     static[:, 120:] = False
