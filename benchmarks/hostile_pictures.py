@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import walks
 from base import Row, infer_camera
-from pictures_of_nothing import SPOILT, draw_display, overlay_figures, yield_pictures, yield_spoilt
+from unreal_pictures import SPOILT, draw_display, overlay_figures, yield_pictures, yield_spoilt
 
 from edgevpr.core.arrays import Image
 from edgevpr.frames.images import list_images, read_image

@@ -1,9 +1,9 @@
 """A link to an autopilot that is worked by hand, by a clock that stands unless it is turned."""
 
 import pytest
-from conversing import Autopilot
 from fakes import FakeClock
 from mavlink_peers import Peer, UdpPort, make_link
+from scripted_autopilot import Autopilot
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from conversing import Autopilot, RecordingListener
+from scripted_autopilot import Autopilot, RecordingListener
 
 from edgevpr.mavlink.channel import Channel, ChannelChoice
 from edgevpr.mavlink.clock import AutopilotClock

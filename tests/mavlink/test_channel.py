@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conversing import STATE, Autopilot, RecordingListener
+from scripted_autopilot import STATE, Autopilot, RecordingListener
 from simulated.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
 from simulated.firmware import PX4 as PX4_PARAMETERS
 

@@ -5,7 +5,7 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
-from conversing import Autopilot
+from scripted_autopilot import Autopilot
 from simulated.firmware import ARDUPILOT, PX4
 
 from edgevpr.core.reasons import ReasonCode

@@ -4,7 +4,7 @@ import logging
 import math
 
 import pytest
-from conversing import ARMED, FIX_3D
+from scripted_autopilot import ARMED, FIX_3D
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, FixTransmission

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from conversing import ARMED, Autopilot
+from scripted_autopilot import ARMED, Autopilot
 
 from edgevpr.mavlink.wire import mavlink
 

@@ -7,9 +7,9 @@ import time
 from contextlib import ExitStack, closing, suppress
 
 import pytest
-from conversing import Autopilot
 from loopback import free_port, wait_until
 from mavlink_peers import make_link
+from scripted_autopilot import Autopilot
 
 from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import ConfigError

@@ -2,7 +2,7 @@
 
 import random
 
-from conversing import Autopilot
+from scripted_autopilot import Autopilot
 
 from edgevpr.mavlink.wire import PacketReader, mavlink
 

@@ -1,7 +1,7 @@
 """An autopilot that restarts is a new one, and one whose link is lost for some seconds is not."""
 
 import pytest
-from conversing import Autopilot, RecordingListener
+from scripted_autopilot import Autopilot, RecordingListener
 from simulated.firmware import ARDUPILOT
 
 from edgevpr.core.types import Position

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from conversing import ABS
+from scripted_autopilot import ABS
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Vehicle

@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from air import PICTURE, make_match
 from fakes import FakeClock
 from simulated.controller import STEP_S, FlightController
 from simulated.motion import Hover, displacement_m
+from simulated_flight import PICTURE, make_match
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, PICTURE, STEP_S, SimFlight, make_match
 from fakes import make_output
+from simulated_flight import HOME, PICTURE, STEP_S, SimFlight, make_match
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, make_match
 from fakes import make_receiver, make_vehicle
+from simulated_flight import HOME, make_match
 
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode

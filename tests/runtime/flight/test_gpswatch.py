@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from air import HOME, make_match
 from fakes import FakeClock, FakeLink, format_note, make_output, make_receiver, make_vehicle
+from simulated_flight import HOME, make_match
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode

@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from air import GPS_SD_M, HOME, SimFlight, make_match, norms
 from fakes import FakeClock, FakeLink, make_output, make_receiver, make_vehicle
+from simulated_flight import GPS_SD_M, HOME, SimFlight, make_match, norms
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import ReasonCode, read_reason

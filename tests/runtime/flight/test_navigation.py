@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from air import HOME, STEP_S, SimFlight, norms
 from fakes import make_receiver, make_vehicle
+from simulated_flight import HOME, STEP_S, SimFlight, norms
 
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position

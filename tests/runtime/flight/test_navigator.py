@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from air import HOME, SimFlight, make_match, norms
 from fakes import make_vehicle
+from simulated_flight import HOME, SimFlight, make_match, norms
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Position

@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from air import SimFlight
 from fakes import FakeClock, FakeLink, make_output
+from simulated_flight import SimFlight
 
 from edgevpr.core.config import SourceSetsConfig
 from edgevpr.mavlink.messages import SET_SOURCE_SET, Health

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from air import HOME, make_match
 from fakes import FakeClock, FakeLink, make_receiver, make_vehicle
+from simulated_flight import HOME, make_match
 
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import move_position, offset_m, offset_position, picture_axes

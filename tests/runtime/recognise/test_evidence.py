@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sureness import make_agreement, make_bare_index
+from fixed_confidence import make_agreement, make_bare_index
 
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode

@@ -2,8 +2,8 @@
 
 import cv2
 import numpy as np
-import pictures_of_nothing
 import pytest
+import unreal_pictures
 from pictures import draw_texture
 from walks import make_map
 
@@ -49,7 +49,7 @@ def test_step_does_not_search_images_without_information(walk):
 
 
 def test_step_accepts_no_image_of_an_unreal_scene(walk):
-    for kind, picture in pictures_of_nothing.yield_pictures(seed=9000, count=23):
+    for kind, picture in unreal_pictures.yield_pictures(seed=9000, count=23):
         event = walk.step(frame(picture, kind))
         assert not event.accepted, f"{kind}: {event.reason}"
 
@@ -57,7 +57,7 @@ def test_step_accepts_no_image_of_an_unreal_scene(walk):
 def test_step_accepts_only_the_correct_place_for_a_mostly_hidden_image(walk):
     recognised = 0
     for number in (2, 5):
-        for kind, picture in pictures_of_nothing.yield_spoilt(9000 + number, draw_texture(number, 240, 320)):
+        for kind, picture in unreal_pictures.yield_spoilt(9000 + number, draw_texture(number, 240, 320)):
             event = walk.step(frame(picture, kind))
             assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
             recognised += event.accepted

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fakes import make_vehicle
-from sureness import make_bare_index
+from fixed_confidence import make_bare_index
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.types import Candidate, Frame, Place, Position

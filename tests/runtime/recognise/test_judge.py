@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sureness import NEEDED, FixedModel, make_agreement, make_bare_index, make_model, make_rule
+from fixed_confidence import NEEDED, FixedModel, make_agreement, make_bare_index, make_model, make_rule
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sureness import make_agreement
+from fixed_confidence import make_agreement
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_position, project_to_metres

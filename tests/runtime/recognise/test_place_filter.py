@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from fakes import make_vehicle
-from sureness import make_model
+from fixed_confidence import make_model
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from fixed_confidence import make_model, make_rule, rate_landmarks
 from map_writer import write_sql
-from pictures_of_nothing import overlay_figures
-from sureness import make_model, make_rule, rate_landmarks
+from unreal_pictures import overlay_figures
 from walks import make_map, walk_over
 
 from edgevpr.core.reasons import ReasonCode

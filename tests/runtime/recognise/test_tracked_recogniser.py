@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fixed_confidence import make_rule
 from pictures import draw_texture
-from sureness import make_rule
 from walks import make_map, walk_over
 
 from edgevpr.core.config import load_config

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from air import SimFlight, norms
+from simulated_flight import SimFlight, norms
 
 from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight.navigator import Navigator
