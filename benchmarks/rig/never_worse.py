@@ -76,8 +76,8 @@ def require_simulators(names: list[str]) -> None:
         sys.exit(f"never_worse: build ArduPilot's simulator, and name its folder in {simulator.VARIABLE}.")
 
 
-def find_row(flight: Flight) -> Path:
-    """Return where the figures of a flight are kept."""
+def find_row_path(flight: Flight) -> Path:
+    """Return the file of the figures of a flight."""
     part = base.read_program_commit(ground.CHECKOUT).replace(" ", "-") if flight.has_edgevpr else "alone"
     return KEPT_FOLDER / part / f"{flight.name}.json"
 
@@ -85,16 +85,16 @@ def find_row(flight: Flight) -> Path:
 def read_kept_rows() -> dict[str, base.Row]:
     """Return the figures that are kept, by the name of the flight."""
     flights = {flight.name: flight for cell in CELLS.values() for flight in (cell.flight, cell.control)}
-    paths = {name: find_row(flight) for name, flight in flights.items()}
+    paths = {name: find_row_path(flight) for name, flight in flights.items()}
     return {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}
 
 
 def fly_cells(names: list[str], anew: set[str], workers: int) -> None:
     """Make the flights of these cells, and their controls, that are not kept, so many side by side."""
     flights = {flight.name: flight for name in names for flight in (CELLS[name].control, CELLS[name].flight)}
-    due = [flight for name, flight in flights.items() if name in anew or not find_row(flight).exists()]
-    for height in {flight.make_scenario().mapped_m for flight in due}:  # made once, not by two flights at once
-        ground.build_place_map(WORK, 100.0, height)
+    due = [flight for name, flight in flights.items() if name in anew or not find_row_path(flight).exists()]
+    for mapped_m in {flight.make_scenario().mapped_m for flight in due}:  # made once, not by two flights at once
+        ground.build_place_map(WORK, 100.0, mapped_m)
 
     def fly_one(flight: Flight) -> None:
         words = (flight.set_up, flight.event, flight.matches)
@@ -122,7 +122,7 @@ def reserve_instance() -> Iterator[int]:
 
 def fly_and_keep(flight: Flight) -> None:
     """Make one flight, and keep its figures; a control that another sweep is flying is waited for."""
-    path = find_row(flight)
+    path = find_row_path(flight)
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path.with_suffix(".lock"), "w") as lock, reserve_instance() as instance:
         fcntl.flock(lock, fcntl.LOCK_EX)
