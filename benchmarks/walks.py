@@ -88,9 +88,7 @@ def make_walk(
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
     given; `more` is anything else of a `Recogniser`."""
     rule = rule or make_accept_rule(technique, make_config().match, 1, read_calibration_for(place_map))
-    settings = MatchSettings(
-        candidates=technique.candidates, verify=True, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
-    )
+    settings = MatchSettings(candidates=technique.candidates, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m)
     encoder = FrameEncoder(technique=technique, levelling=levelling)
     return Recogniser(encoder, place_map, Matcher(index, rule, search), make_meter(), settings=settings, **more)
 

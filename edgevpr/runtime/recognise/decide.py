@@ -66,12 +66,11 @@ class Matcher:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchSettings:
-    """Settings of the recogniser. `candidates` places are compared (None: all, fully; see `compare_places`).
-    `verify` enables the landmark check. With `all_evidence`, landmarks are compared even where they decide nothing, to
-    fit a model. The accuracy of a position is never below `min_accuracy_m` (1 sigma)."""
+    """Settings of the recogniser. `candidates` places are compared (None: all, fully; see `compare_places`). With
+    `all_evidence`, landmarks are compared even where they decide nothing, to fit a model. The accuracy of a position is
+    never below `min_accuracy_m` (1 sigma)."""
 
     candidates: int | None = None
-    verify: bool = True
     all_evidence: bool = False
     min_accuracy_m: float = 1.0
 
@@ -259,7 +258,7 @@ class Decider:
         all_evidence = self.settings.all_evidence
         is_plausible = best.match.score >= rule.min_verify_score
         # A sequence is judged as a whole, so its newest query is not verified.
-        verifies = is_plausible and self.settings.verify and self.matcher.search is None and spec.cells is not None
+        verifies = is_plausible and self.matcher.search is None and spec.cells is not None
         if verifies and spec.looks_down:
             with step("verify"):
                 agreement = verifier.compare_best(ranking)
