@@ -37,6 +37,8 @@ lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --config-file benchmarks/mypy.ini benchmarks/*.py benchmarks/tests/*.py
+	$(BIN)/mypy --config-file benchmarks/mypy.ini benchmarks/rig/*.py benchmarks/arm64/*.py
 	$(BIN)/lint-imports --no-cache
 
 # Figures on real image sets (../shared/data, or the folder named in EDGEVPR_DATA) into benchmarks/results/.

@@ -20,6 +20,7 @@ from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import base
@@ -82,7 +83,7 @@ class FaultyCamera(threading.Thread):
                 if self.fault != "gone":
                     self._send(connection.makefile("wb", buffering=0))
 
-    def _send(self, sink: object) -> None:
+    def _send(self, sink: Any) -> None:
         codec, pixels = stream = STREAMS.get(self.fault, USUAL_STREAM)
         options = {"max_interleave_delta": "1", "flush_packets": "1"}
         with av.open(sink, "w", format="mpegts", container_options=options) as container:
@@ -174,7 +175,7 @@ class Lap:
         true_m = [np.interp(t_s, truth[:, 0], truth[:, axis]) for axis in (1, 2)]
         return math.dist(true_m, to_metres(lat_deg, lon_deg))
 
-    def _handle_message(self, message: object) -> list:
+    def _handle_message(self, message: Any) -> list:
         self._record_truth()  # a camera that is gone asks for no pose
         if message.get_type() == "COMMAND_INT" and message.command == POSITION_FIX:
             fix = time.monotonic() - message.param2, message.x / 1e7, message.y / 1e7, message.param3

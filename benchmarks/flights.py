@@ -163,7 +163,7 @@ def run_flight(flight: Flight, sites: dict[str, Site]) -> list[Row]:
         for mode, recogniser in recognisers.items():
             rows.append(query | {"mode": mode} | _score_fix(recogniser.step(frame, reports[number]), site, query))
     for opened_file in (*photos.values(), opened.place_map):
-        opened_file.close()
+        opened_file.close()  # type: ignore[attr-defined]
     return rows
 
 
@@ -244,7 +244,7 @@ def _compute_figures(rows: Sequence[Row]) -> dict:
         "longest_gap_s": {"median": round(np.median(gaps_s), 1), "worst": round(max(gaps_s), 1)} if gaps_s else None,
         "error": summarise([row["off_m"] for row in right]) if right else None,
         "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
-        "within": compute_sigma_shares(*zip(*own, strict=True), 0.0) if own else None,
+        "within": compute_sigma_shares(*zip(*own, strict=True), more_m2=0.0) if own else None,
     }
 
 

@@ -78,10 +78,10 @@ def _fit_scale(sites: Sequence[tuple[SiteEvidence, Model]]) -> Scale:
     is in no tail of `off_place`."""
     foreign = [(model, evidence) for site, model in sites for evidence in site.foreign]
     own = [(model, evidence, right) for site, model in sites for evidence, right in site.own]
-    wrong = [(model, evidence) for model, evidence, right in own if not right and evidence.leads]
+    wrong = [(model, evidence) for model, evidence, right in own if not right and evidence.is_unambiguous]
     count, part = len(own), _OFF_PLACE_TAIL
     if len(wrong) < _MIN_WRONG_MATCHES:  # ground of other sites stands in for ground that looks alike
-        wrong = [(model, evidence) for model, evidence in foreign if evidence.leads]
+        wrong = [(model, evidence) for model, evidence in foreign if evidence.is_unambiguous]
         count, part = len(foreign), _STAND_IN_TAIL
     logits = [model.of_map.logit(evidence.figures()) for model, evidence in foreign]
     off_map = _fit_tail(logits, len(foreign), _OFF_MAP_TAIL)

@@ -110,7 +110,8 @@ def run_sweeps(folder: Path) -> list[Row]:
 def _answer_level(map_walks: list[MapWalk], starts: list[StartView], camera: str, sweep: str, level: float) -> Row:
     """Ask every technique for the place of every start, at one level of a sweep: how many were `asked`, how much of
     their views showed anything, and what was `found` by each: recall@1, accepted, accepted for a wrong place."""
-    shares, answers = [], [{"hits": [], "accepted": 0, "wrong": 0} for _ in map_walks]
+    shares = []
+    answers: list[Row] = [{"hits": [], "accepted": 0, "wrong": 0} for _ in map_walks]
     for number, start in enumerate(starts):
         rng = np.random.default_rng((number, list(SWEEPS).index(sweep)))
         change = make_view(camera, sweep, level, start.size, rng) if sweep in CAMERA_SWEEPS else np.eye(3)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -54,7 +55,7 @@ class Camera:
         self.is_frozen = False
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _Viewer)
         self._server.daemon_threads = True
-        self._server.camera = self
+        self._server.camera = self  # type: ignore[attr-defined]
         self.uri = f"http://127.0.0.1:{self._server.server_port}/"
         self._threads = [threading.Thread(target=work) for work in (self._server.serve_forever, self._take_pictures)]
 
@@ -135,6 +136,8 @@ def apply_mount(pose: CameraPose, mount: Mount) -> CameraPose:
 
 
 class _Viewer(BaseHTTPRequestHandler):
+    server: Any  # with the `camera`
+
     def log_message(self, *_: object) -> None:
         pass
 
