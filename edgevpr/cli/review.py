@@ -1,4 +1,5 @@
-"""Commands after a flight: `report` makes a page of its log, `replay` replays a recorded flight on the ground."""
+"""Commands for use after a flight: `edgevpr report` makes a page of its log, `edgevpr replay` replays a recorded flight
+on the ground."""
 
 from argparse import Namespace
 from dataclasses import asdict

@@ -47,7 +47,8 @@ class Parser(ArgumentParser):
 
 
 def add_command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
-    """Add a command and return its parser. `run` gets the parsed arguments and returns the exit code; `text`: help."""
+    """Add a command and return its parser. `run` is called with the parsed arguments and returns the exit code; `text`
+    is the command's help."""
     parser = _add_parser(commands, name, text)
     parser.set_defaults(run=run, parser=parser)
     parser.epilog = format_examples(parser.prog.partition(" ")[2])
@@ -233,7 +234,8 @@ def parse_count(text: str) -> int:
 
 
 def check_output(target: str, source: str) -> Path:
-    """Return the path of output `target`. Raises UsageError if it is the input `source`, or its folder is missing."""
+    """Return the path of the output file `target`. Raises UsageError if it is the input file `source`, or if its folder
+    does not exist."""
     from edgevpr.core.files import require_folder
 
     path = Path(target)

@@ -60,7 +60,7 @@ def format_build(path: str, built_map: "BuiltMap", from_orthophoto: bool) -> Ite
 
 
 def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
-    """Yield the result of refining a map."""
+    """Yield the lines of a refined map: how many places moved, by how far, and which were recorded far off."""
     if refined.without_position == refined.places:
         yield "  not refined: no place has a position"
         return

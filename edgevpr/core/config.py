@@ -251,7 +251,8 @@ def resolve_log_paths(log: LogConfig, folder: str) -> LogConfig:
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:
-    """Build the dataclass `cls` from a mapping. `where`, `prefix`: file and start of each key, for messages.
+    """Build the frozen dataclass `cls` from a mapping. `where` and `prefix` are for messages: the file, and the start
+    of each key.
 
     Raises ConfigError for an unknown or missing key, and for a value of the wrong type or out of range.
     """

@@ -155,7 +155,8 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that a query may show, and the result `match` of comparing both. Retrieval lists them best first."""
+    """A place that the query may show, and the result `match` of comparing the two. Retrieval returns a list of
+    candidates, best first."""
 
     place: Place
     match: FineMatch

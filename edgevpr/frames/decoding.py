@@ -161,7 +161,8 @@ class VideoDecoder:
         )
 
     def fetch(self) -> TimedPacket | None:
-        """Wait for the next packet; None at the end or if the stream is lost. Another thread may decode meanwhile."""
+        """Wait for the next packet and return it; None at the end of the file or if the stream is lost. One thread may
+        fetch while another decodes."""
         index = self.stream.index
         with av.logging.Capture() as log_lines:
             try:

@@ -24,7 +24,8 @@ _LATE_REOPEN_S = 30.0  # longer than it takes to estimate a clock's rate
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a source. `text` is for people. `must_reopen`: for so long that it should be reopened."""
+    """What is wrong with a source. `text` is for people. `must_reopen`: the fault has lasted so long that the source
+    should be reopened."""
 
     condition: Condition
     text: str

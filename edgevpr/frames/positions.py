@@ -44,7 +44,8 @@ _ANGLE_INDICES = [1, 3, 4]  # positions in `_to_numbers` of the angles that wrap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeoTag:
-    """What is known of an image, as in `Frame`; the time is in seconds since 1970. None: unknown."""
+    """Position, heading, time (seconds since 1970), roll, pitch and height above ground of an image, as defined by
+    `Frame`. None: unknown."""
 
     position: Position | None = None
     heading_deg: float | None = None

@@ -59,8 +59,9 @@ def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
 
 
 class SnapshotCapture:
-    """A `Capture` that requests the image at `uri` every `period_s` seconds. Its time is that of the request, when most
-    cameras take it. If the same file came twice, images may be as old as the previous request."""
+    """A `Capture` that requests the image at `uri` every `period_s` seconds. Its capture time is that of the request,
+    when most cameras take it. A camera that returned the same file twice keeps an image ready, which may be as old as
+    the previous request."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock

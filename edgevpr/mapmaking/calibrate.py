@@ -1,5 +1,6 @@
-"""Calibrates a map: makes queries with known answers from the map's pictures, and fits the confidence model to them. It
-computes the probability that a match is correct from its *evidence*: measurements such as score and margin.
+"""Calibrates a map: makes queries with known answers from the map's own pictures, and fits the confidence model to the
+results. This model computes the probability that a match is correct from its *evidence*: named measurements, such as
+score and margin.
 
 Each picture is altered as if taken on another day and in another season (see `changes`), then searched for in the map
 in three ways:
@@ -67,9 +68,10 @@ _LOW_PRECISION = 0.5  # required precision at which hardly any match is rejected
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryResult:
-    """Result of a query made from a picture of the map. `place_id`: its place. `way`: how it was made (THERE, LEFT_OUT,
-    MIRRORED). `right`: the best match is the correct place. `evidence`: the evidence for the best match (None: the
-    picture has too little texture to search for). `refused`: it was rejected for a reason other than low confidence."""
+    """Result of one query made from a picture of the map. `place_id`: the place of this picture. `way`: how the query
+    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the correct place. `evidence`: the evidence for the
+    best match (None: the picture has too little texture to search for). `refused`: the match was rejected for a reason
+    other than low confidence."""
 
     place_id: int
     way: str

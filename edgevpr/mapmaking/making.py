@@ -1,4 +1,5 @@
-"""Builds a map (`edgevpr map build`): makes places from pictures, then refines and calibrates it (`finishing`)."""
+"""Builds a complete map: makes places from pictures, then refines and calibrates the map (`finishing`). The command
+`edgevpr map build` calls it."""
 
 import logging
 from collections.abc import Callable, Iterator

@@ -203,8 +203,9 @@ class ReportDelay:
 
 
 class ForeignStamps:
-    """Finds timestamps of other programs not in the autopilot's time. ArduPilot has one correction for all senders
-    (`JitterCorrection`). After a stamp ahead of its own time, it takes ours as sent 0.5 s before they arrive."""
+    """Finds timestamps of other programs that are not in the autopilot's time. ArduPilot has one timestamp correction
+    for all senders of a link (`JitterCorrection`). After a timestamp ahead of its own time, it treats our messages as
+    sent 0.5 s before they arrive."""
 
     def __init__(self) -> None:
         self._reported: set[tuple[str, str]] = set()

@@ -79,9 +79,10 @@ class TimeStamps:
             return min(self._largest, _MAX_STAMP)
 
     def check(self, stream: Stream, stamp: int) -> str | None:
-        """Return why a message with this timestamp is rejected, None if it is admitted. An admitted timestamp is
-        stored, so check the signature first. Those of a stream must increase; the first of a new one must be within a
-        minute of the largest. The very first stream may be ahead: it sets the time of a board without a clock."""
+        """Return why a message with this timestamp is rejected, or None if it is admitted. An admitted timestamp is
+        stored, so check the signature first. The timestamps of a stream must increase. The first of a new stream must
+        be within a minute of the largest. The very first stream may be ahead: it sets the time of a board without a
+        real-time clock."""
         with self._lock:
             now = max(self._largest, self._now())
             if stamp <= self._streams.get(stream, now - _MAX_STREAM_OFFSET):

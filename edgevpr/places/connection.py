@@ -73,7 +73,8 @@ class MapConnection:
 
     @classmethod
     def open_for_writing(cls, path: str | Path) -> "Self":
-        """Open a map to add places. Raises the errors of `open`, and MapBusyError if another program does so."""
+        """Open an existing map to add places. Raises the errors of `open`, and MapBusyError if another program has it
+        open for writing."""
         return cls._open(mapfiles.require_map_file(path), is_writable=True)
 
     @classmethod
@@ -144,7 +145,8 @@ class MapConnection:
                 raise
 
     def scan_rows(self, columns: str) -> Iterator[tuple[int, Values | None]]:
-        """Yield the id and `columns` (None: unreadable) of every place, see `rows.scan_rows`. Raises MapError."""
+        """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan_rows`). Raises
+        MapError."""
         with translate_errors(self.path):
             yield from rows.scan_rows(self.db, columns)
 

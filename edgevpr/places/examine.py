@@ -58,7 +58,8 @@ class MapCheck:
 
 
 def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterator[PlaceCheck]:
-    """Read and check all values of every place, or of the ids `only`; yield the results in the order of adding."""
+    """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order in
+    which the places were added."""
     spec = place_map.spec
     for place_id, row in place_map.scan_rows(rows.ALL_COLUMNS) if only is None else _read_rows(place_map, only):
         if row is not None:

@@ -1,4 +1,5 @@
-"""GeoPackage (OGC 12-128r18, 1.3) in map files: tables, points and times that QGIS, GDAL and `sqlite3` read."""
+"""The GeoPackage standard (OGC 12-128r18, version 1.3) as map files use it: tables, points and times that QGIS, GDAL
+and `sqlite3` can read."""
 
 import struct
 from datetime import datetime, timezone
@@ -98,7 +99,8 @@ def decode_point_or_none(geom: object) -> tuple[float, float] | None:
 
 
 def format_utc(t_utc_s: float | None) -> str | None:
-    """Format seconds since 1970 as GeoPackage DATETIME (UTC, ms); None for None or an impossible time."""
+    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None or an impossible
+    time."""
     if t_utc_s is None:
         return None
     try:

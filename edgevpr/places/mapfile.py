@@ -60,7 +60,8 @@ class _StoredText:
 
 
 class PlaceMap(MapConnection):
-    """An open map. `left_out` maps the id of each unreadable place found so far to the reason, in order of discovery.
+    """An open map. `left_out` maps the id of each place that could not be read so far to the reason in a few words, in
+    the order of discovery.
 
     `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the camera calibration
     used to undistort their pictures. `attribution`: attribution texts of the orthophotos from which places were cut.
@@ -102,7 +103,8 @@ class PlaceMap(MapConnection):
         return int(cursor.lastrowid or 0)
 
     def move_place(self, place_id: int, position: Position, pose: Pose | None) -> None:
-        """Replace position and pose (None: unknown) of a place, in a `transaction`. Raises sqlite3.Error."""
+        """Replace the position and the pose (None: unknown) of an existing place, inside a `transaction`. Raises
+        sqlite3.Error."""
         geom, content = geopackage.encode_point(position.lat_deg, position.lon_deg), rows.make_pose_content(pose)
         # The trigger `places_moved` sets columns to NULL when geom changes, so they are written in a second statement.
         self.db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (geom, place_id))
@@ -117,7 +119,8 @@ class PlaceMap(MapConnection):
         self._record_text(mapspec.MASK, sha256)
 
     def record_lens(self, path: str | None) -> None:
-        """Store the name of the camera calibration that undistorted the pictures (None: no name). Raises MapError."""
+        """Store the name of the camera calibration used to undistort the pictures of the places. None: store nothing.
+        Raises MapError."""
         if path is not None:
             self._record_text(mapspec.LENS, Path(path).name)
 
@@ -170,7 +173,8 @@ class PlaceMap(MapConnection):
             return rows.decode_part(content, "fine", self.spec.fine), point
 
     def read_landmarks(self, place_id: int) -> bytes | None:
-        """Read a place's encoded landmarks (None: it has none). Raises PlaceError if it is missing or damaged."""
+        """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
+        is missing or damaged."""
         with self._convert_row_errors(place_id):
             return rows.read_landmarks(self.read_row(int(place_id), "landmarks, landmarks_crc32"))
 

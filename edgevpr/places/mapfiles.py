@@ -108,7 +108,8 @@ def remove_map(path: Path) -> None:
 
 
 def connect(path: Path, mode: str, wait_s: float = MAX_WAIT_S) -> sqlite3.Connection:
-    """Open a map file in SQLite's `mode`, ro or rw; wait `wait_s` at most for other writers. Raises sqlite3.Error."""
+    """Open a map file in SQLite's `mode`, ro or rw. `wait_s`: longest wait in seconds for another program that is
+    writing. Raises sqlite3.Error."""
     # Autocommit: transactions are begun explicitly, so that nothing is ever committed partially.
     db = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}",

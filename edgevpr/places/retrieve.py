@@ -154,7 +154,8 @@ class _Comparison:
         return [choice for _, choice in quick_scores[:max_matches]]
 
     def choose_more(self, is_eligible: Bools, count: int) -> list[Choice]:
-        """Choose up to `count` more eligible places: skipped ones or, without any, those with the best scan scores."""
+        """Choose up to `count` more places where `is_eligible` is True: skipped ones or, if there are none, those with
+        the best scan scores."""
         skipped = [choice for _, choice in self._skipped if is_eligible[choice[0]]][:count]
         return skipped or choose_best(self._scan, self._used_scores, is_eligible, count)
 

@@ -30,7 +30,8 @@ class Stage:
 
 @contextmanager
 def meter_stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
-    """Meter a block: `with meter_stage() as stage: ...`, then read `stage.cost`. The CPU time is of all threads."""
+    """Meter a block of code: `with meter_stage() as encoding: ...`, then read `encoding.cost`. The CPU time includes
+    all threads."""
     stage = Stage()
     wall_s, cpu_s = wall_clock(), cpu_clock()
     try:
@@ -66,7 +67,8 @@ class QueryMeter:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (field of `StepCosts`): `with meter.step("encode"):`. Repeated steps add up."""
+        """Meter a step of the query (a field of `StepCosts`): `with meter.step("encode"):`. The costs of a repeated
+        step are summed."""
         stage = Stage()
         try:
             with meter_stage(self._wall_clock, self._cpu_clock) as stage:
@@ -134,7 +136,8 @@ class FlightEnergy:
 
 @dataclass(frozen=True, slots=True)
 class MachineLoad:
-    """Load of the machine: each core's utilisation, 0..1, since the last `measure_machine_load`, and RAM in bytes."""
+    """Load of the machine: the utilisation of each core, 0..1, since the last call of `measure_machine_load`, and RAM
+    in bytes."""
 
     core_usage: tuple[float, ...]
     ram_used_bytes: int

@@ -1,4 +1,5 @@
-"""Compares a flight with its replay, for `edgevpr replay`: lines of both logs and, byte by byte, packets sent."""
+"""Compares a flight with its replay, for `edgevpr replay`: the lines of both logs, and byte by byte the packets sent on
+the link."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -18,9 +19,10 @@ _PROGRAM_FIELDS = ("version", "machine", "python", "libraries")
 @dataclass(slots=True)
 class LineComparison:
     """Comparison of the logs of a flight and its replay. `alike`: number of equal lines. `others`: the lines that
-    differ. `after`: number of the flight's lines after the replay's end. `program`: differing fields of the first line
-    on the program. Each of the `others` has the line's `kind`, time `t_mono_s` and `query`, and either `fields`, the
-    differing fields by dotted name (such as "fix.sent"), or `only_in`: "replay" if the flight has no such line."""
+    differ. `after`: number of lines of the flight after the end of the replay. `program`: differing fields of the first
+    line that describe the program. Each of the `others` has the `kind` of the line, its time `t_mono_s`, its `query`,
+    and either `fields`, the differing fields by dotted name (such as "fix.sent"), or `only_in`: "replay" if the flight
+    has no such line."""
 
     alike: int = 0
     others: list[Line] = field(default_factory=list)

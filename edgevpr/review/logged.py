@@ -35,7 +35,8 @@ SENT_OUTCOMES = (FixOutcome.ACCEPTED, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFix:
-    """The fix of a query. `why`: why it was not sent or accepted (None: unknown). `position` None: nothing to send."""
+    """The fix of a query. `why`: reason why it was not sent or not accepted (None: unknown). `position`: None if there
+    was nothing to send."""
 
     outcome: FixOutcome
     why: Reason | None

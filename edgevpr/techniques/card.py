@@ -92,7 +92,8 @@ class Card:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that an output depends on: weights, preparation of the picture, and names of the outputs."""
+        """SHA-256 of everything that a feature map or vector depends on: the weights, the preparation of the picture,
+        and the names of the outputs."""
         return compute_digest([self.sha256, _drop_unused_keys(self.input), _drop_unused_keys(self.outputs)])
 
 

@@ -204,10 +204,11 @@ class CoHog:
         return fields[number, grid.side]
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
-        """Compare the query with the blocks `fine` of a place: compute C = A B^T (thesis 6.2.3), where A are the good
-        regions of the query and B those of the place, then the score according to `matching` (0 without a good region).
-        A nadir query is compared under `hypotheses` (None: all); `fit_alignment` refines shift, rotation and height of
-        the best. Finally, the score is reduced if the structures of the two images agree poorly (see `overlay`)."""
+        """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), where A are the
+        good regions of the query and B those of the place, then the score according to `matching` (0 without a good
+        region). A nadir query is compared under `hypotheses` (None: all); `fit_alignment` refines shift, rotation and
+        height of the one with the highest score. Finally, the score is reduced if the structures of the two images
+        agree poorly (see `overlay`)."""
         reference = self._restore_regions(fine)
         if self._is_nadir:
             best, match, nearest = self._find_best_hypothesis(query, reference, hypotheses)

@@ -75,7 +75,8 @@ def compute_vote_fraction(indices: Ints, nearest: Ints, sides: tuple[int, int], 
 
 
 def find_most_similar(regions: Singles, reference: Singles) -> Ints:
-    """Return, for each of `regions` (G, P), the index of the most similar of a place's `reference` (N, P): int (G,)."""
+    """Return the index of the most similar region of a place, among its regions `reference` (N, P), for each of
+    `regions` (G, P): int (G,)."""
     nearest = np.empty(len(regions), np.intp)
     for first in range(0, len(regions), _REGIONS_PER_PRODUCT):
         block = slice(first, first + _REGIONS_PER_PRODUCT)

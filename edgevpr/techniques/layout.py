@@ -19,7 +19,8 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Ints, Singles
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A grid of `side` x `side` cells over a place. `channels`: indices of the averaged patterns, which vary most."""
+    """A grid of `side` x `side` cells over a place. `channels`: indices of the patterns that are averaged, those that
+    vary most from cell to cell."""
 
     side: int
     channels: tuple[int, ...]

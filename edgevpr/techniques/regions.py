@@ -80,7 +80,8 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
 def cross_region_bow(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
 ) -> RegionTechnique:
-    """Make `cross_region_bow`: the `regions` regions of highest energy, scanned as a bag of `words` visual words.
+    """Make `cross_region_bow`: the `regions` regions of highest energy in a feature map, scanned as a bag of `words`
+    visual words.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, as in thesis 4.2.1, but with one feature map: the paper finds regions in `conv5_3` of VGG-16 and

@@ -92,7 +92,8 @@ class VectorTechnique:
 
     def pack(self, coarse: Array, mean: Singles) -> Array:
         """Make the rows in RAM of the forms `8bit` and `1bit`, (N, *row shape), from the vectors `coarse`, float16 (N,
-        D), and the map's mean (D,). An `8bit` row is D int8 values, then two float32: quantisation step and length."""
+        D), and the map's mean (D,). A row of `8bit` is D int8 values, then the bytes of two float32: quantisation step
+        and length."""
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for start in range(0, len(coarse), self._block_places):
             block = slice(start, start + self._block_places)

@@ -53,7 +53,8 @@ def count_cells(cells: int, ratio: float) -> int:
 
 
 def compute_scale(cells: int, ratio: float) -> float:
-    """Return the exact height ratio of a view: its whole number of cells along a side over the place's `cells`."""
+    """Return the exact height ratio of a view: its number of cells along one side, an integer, divided by the number
+    `cells` of a place."""
     return count_cells(cells, ratio) / cells
 
 

@@ -231,7 +231,8 @@ def read_prior(
 
 
 def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
-    """Recognise the image at `path`. Raises ModelError if that fails: figures without it would mislead."""
+    """Recognise the image at `path`, given its `tag`. Raises ModelError if recognition fails, because figures that omit
+    queries would mislead."""
     event = recogniser.step(
         Frame(
             image=read_image(path),
@@ -273,7 +274,8 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
 
 
 def read_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a source. Raises ImageError for an unusable one: figures without it would mislead."""
+    """Yield all frames of a source. Raises ImageError for the first that cannot be used, because figures that omit
+    images would mislead."""
     while not source.ended:
         if frame := source.read(timeout_s=1.0):
             yield frame

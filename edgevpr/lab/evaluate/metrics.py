@@ -1,4 +1,5 @@
-"""Results of an evaluation, and their quality figures (thesis 2.7, 6.3.1), as functions of each query's best match.
+"""Results of an evaluation, and their quality figures (thesis 2.7 and 6.3.1), as pure functions of the best match of
+every query.
 
 `scores`, float (N,), is the score of each query's best match, -inf if it has none. `ranks`, float (N,), is the rank,
 from 0, of its first correct reference, infinite if there is none. `has_match`, bool (N,), is True if its place is in

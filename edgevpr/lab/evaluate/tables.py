@@ -75,7 +75,8 @@ COSTS: tuple[Column, ...] = (
 
 
 def make_rows(result: TechniqueResult, columns: Sequence[Column], include_in_map: bool = True) -> Iterator[list[str]]:
-    """Yield the row of a result and, with `include_in_map`, that of queries whose place is in the map, if not all."""
+    """Yield the row of a result. With `include_in_map`, also yield a row for the queries whose place is in the map, if
+    there are others."""
     yield [result.technique, *(format_cell(result) for _, format_cell in columns)]
     if include_in_map and result.with_match:
         yield [f"{result.technique}, in map", *(format_cell(result.with_match) for _, format_cell in columns)]

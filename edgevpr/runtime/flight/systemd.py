@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from edgevpr.core.text import sanitize
 
-# Requested at startup: loading a map or choosing a technique takes minutes on a slow board.
+# Requested at startup: loading a map takes minutes on a slow board.
 MAX_START_US = 1_800_000_000
 _SEND_TIMEOUT_S = 0.5
 

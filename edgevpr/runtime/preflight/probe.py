@@ -40,7 +40,8 @@ _PYMAVLINK_MB = 12.0  # resident memory added by importing pymavlink (measured o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueCosts:
-    """Costs of a technique on one machine, measured or with times from instruction counts (`StageCost`: wall, CPU).
+    """Costs of a technique on one machine: measured, or with times from instruction counts. A `StageCost` is wall time
+    and CPU time.
 
     `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
     file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than

@@ -38,8 +38,9 @@ _ROTATIONS_EXPONENT = 2 / 3
 
 @dataclass(frozen=True, slots=True)
 class Logistic:
-    """A logistic regression on the evidence for a match. Its logit is `bias` plus the figures `names` times their
-    `weights`. `scales` are the standard deviations of these figures over many sites, used to adapt it to a map."""
+    """A logistic regression on the evidence for a match. Its logit is `bias` plus the sum of the figures in `names`,
+    each times its weight in `weights`. `scales` are the standard deviations of these figures over many sites, used to
+    adapt the regression to a map."""
 
     names: tuple[str, ...]
     weights: tuple[float, ...]

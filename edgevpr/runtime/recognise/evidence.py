@@ -1,8 +1,9 @@
 """Evidence for a match: the figures from which its confidence is computed (see `confidence`).
 
-There are four kinds: for a camera that looks down, with landmarks (DOWN) or without (DOWN_BARE), and for one ahead
-(AHEAD, or AHEAD_PROVEN where landmarks support the match). A place *elsewhere* is outside the best place's
-neighbourhood. Regions *agree* if they show the same shift. A larger figure supports the match, except `rank_gap`.
+There are four kinds: for a camera that looks straight down, with landmarks (DOWN) or without (DOWN_BARE), and for one
+that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks support the match). A place *elsewhere* is outside the best
+place's neighbourhood. Regions *agree* if they show the same shift between query and place. A larger figure supports the
+match, except `rank_gap`.
 
 * agree: logarithm of the fraction of regions that agree (see `compute_share`)
 * lead: `agree` minus the largest `agree` of a place elsewhere
