@@ -1,11 +1,11 @@
-"""Mutants of the decisions that keep a wrong position from an aircraft.
+"""Mutation tests of the decisions that keep wrong positions from the aircraft.
 
-Cosmic Ray changes one operator or number at a time, and the tests that hold the module run. A mutant that no test
-notices survives. `benchmarks/mutants.yaml` names the modules, their tests, the changes, and why a survivor may live.
+Cosmic Ray changes one operator or number of a module at a time, and the tests of the module run on this mutant. A
+mutant survives if no test fails. `benchmarks/mutants.yaml` lists modules, tests, changes, and acceptable survivors.
 """
 
-# A mutant is only in the memory of a process forked for it: no file ever holds one, also if the run is killed, and what
-# the module imports is loaded once. What was killed is kept in mutants_work/.
+# Each mutant is compiled in a forked process and never written to a file, so a killed run leaves the source as it was,
+# and the module's imports are loaded only once. mutants_work/ records which mutants were killed.
 
 import json
 import os
@@ -29,7 +29,7 @@ from cosmic_ray.plugins import get_operator
 PLAN = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 WORK = base.REPOSITORY / "mutants_work"
 MAX_PROCESSES = int(os.environ.get("JOBS", 2))
-MAX_CPU_S = 60  # of the tests of one mutant; one that takes longer counts as killed
+MAX_CPU_S = 60  # for the tests of one mutant; a mutant that takes longer counts as killed
 FORK = get_context("fork")
 
 
@@ -45,28 +45,28 @@ def main() -> int:
 
 
 def list_mutants(source: str) -> Iterator[tuple[str, str]]:
-    """Yield the mutants of a module: the change of its line, and the whole source."""
-    seen = Counter[str]()
+    """Yield the mutants of a module: the changed line as a text "before => after (number)", and the whole source."""
+    occurrences = Counter[str]()
     for name in PLAN["operators"]:
         operator = get_operator(f"core/{name}")()
         positions = sum(len(list(operator.mutation_positions(node))) for node in ast_nodes(get_ast(source)))
-        for occurrence in range(positions):
-            mutant = mutate_code(source, operator, occurrence)
+        for index in range(positions):
+            mutant = mutate_code(source, operator, index)
             lines = zip(source.splitlines(), mutant.splitlines(), strict=True)
             change = " => ".join(line.strip() for line in next(pair for pair in lines if pair[0] != pair[1]))
             if not re.match(PLAN["unchanged"], change):
-                seen[change] += 1
-                yield f"{change} ({seen[change]})", mutant
+                occurrences[change] += 1
+                yield f"{change} ({occurrences[change]})", mutant
 
 
 def run_module(module: str) -> None:
-    """Run the tests of a module on each of its mutants, and keep which ones were killed."""
+    """Run the tests of a module on each of its mutants, and write to WORK which mutants they killed."""
     name, source = module.removesuffix(".py").replace("/", "."), (base.REPOSITORY / module).read_text()
     path = WORK / f"{Path(module).stem}.json"
-    pytest.main(["--collect-only", "-qq", "-p", "no:xdist", *PLAN["modules"][module]])  # loads all that is needed
+    pytest.main(["--collect-only", "-qq", "-p", "no:xdist", *PLAN["modules"][module]])  # to load every import
     unload_module(name)
-    mutants, before = dict(list_mutants(source)), json.loads(path.read_text()) if path.exists() else {}
-    killed = {"": False} | {change: before.get(change, False) for change in mutants}  # the first is the module itself
+    mutants, previous = dict(list_mutants(source)), json.loads(path.read_text()) if path.exists() else {}
+    killed = {"": False} | {change: previous.get(change, False) for change in mutants}  # "": the unchanged module
     waiting, running = [change for change in reversed(killed) if not killed[change]], {}
     while waiting or running:
         while waiting and len(running) < MAX_PROCESSES:
@@ -79,26 +79,26 @@ def run_module(module: str) -> None:
             process.join()
             killed[change] = process.exitcode != 0
         if killed[""]:
-            sys.exit(f"{module}: its tests fail without a change")
+            sys.exit(f"{module}: the tests fail on the unchanged module")
         WORK.mkdir(exist_ok=True)
         path.write_text(json.dumps(killed, indent=0))
     print(f"{module}: {len(mutants)} mutants, {sum(killed.values())} killed", flush=True)
 
 
 def unload_module(name: str) -> None:
-    """Unload a module, all that import it, and the tests: they are to be loaded with the mutant."""
-    users = {name, *grimp.build_graph("edgevpr", cache_dir=None).find_downstream_modules(name)}
-    for other, module in list(sys.modules.items()):
+    """Unload a module, every module that imports it, and the tests, so that they are loaded again with the mutant."""
+    importers = {name, *grimp.build_graph("edgevpr", cache_dir=None).find_downstream_modules(name)}
+    for loaded, module in list(sys.modules.items()):
         path = getattr(module, "__file__", None) or ""
-        if other in users or path.startswith(str(base.REPOSITORY / "tests")):
-            parent, _, child = other.rpartition(".")
+        if loaded in importers or path.startswith(str(base.REPOSITORY / "tests")):
+            parent, _, child = loaded.rpartition(".")
             if parent in sys.modules:
                 vars(sys.modules[parent]).pop(child, None)
-            del sys.modules[other]
+            del sys.modules[loaded]
 
 
 def run_tests(module: str, name: str, source: str) -> None:
-    """Run the tests of a module with another source, and exit with their code."""
+    """Run the tests of a module with `source` in its place, and exit with the exit code of pytest."""
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S))
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(1, 2)

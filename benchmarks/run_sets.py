@@ -1,8 +1,8 @@
 """Measure every technique, in every form, on every image set of a folder: `make results`.
 
-Writes one JSON file a set into benchmarks/results/ and, from all files that are there, a summary, `sets.md`, the
-precision-recall curves, and the table of accuracy that travels with the program. The sets are not part of edgevpr; each
-is a folder with query/, ref/, ground_truth.csv and, where GPS is known, positions.csv.
+Writes one JSON file per set to benchmarks/results/ and, from all JSON files in that folder, the summary `sets.md`, the
+precision-recall curves, and the accuracy table that ships with edgevpr. The image sets are not part of edgevpr; each is
+a folder with query/, ref/, ground_truth.csv and, where GPS is known, positions.csv.
 """
 
 import argparse
@@ -32,24 +32,24 @@ from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import hash_model_file
 
-FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
-JOINED = "aerial_joined"  # all sets from the air as one map: the rows that are measured on it
+FIVE_PLACES = "only five places: made to study changes; recall on five places tells nothing"
+JOINED = "aerial_joined"  # one map of all aerial sets; JOINED_ROWS are measured on it
 JOINED_ROWS = ("cohog", "cohog, exact")
-# What is not measured, and why.
+# Sets that are not measured, and why.
 LEFT_OUT = {"grief_michigan_monthly": FIVE_PLACES, "grief_stromovka_monthly": FIVE_PLACES}
-# Rows that no board is offered: other weights, another way to match or to ask, or a comparison with everything.
+# Rows not recommended to any board: other weights, other ways to match or query, or a comparison with all places.
 NOT_OFFERED = ("exact", "thesis", "sequence", "one frame", "original weights", "known", "followed")
-# Of a set whose sites have no positions on Earth: where they are said to be, how far apart, and the size of a pixel.
+# For sets whose sites have no known positions: an invented first position, the spacing of sites, the size of a pixel.
 _FIRST_SITE_DEG = (37.0, 36.0)
 _SITE_SPACING_M = 20_000.0
 _PIXEL_M = 0.5
 _COLUMNS = ("query_file", "ref_files", "ref_files_loose")
-_MAX_CURVE_POINTS = 25  # that are kept: a curve is only drawn
+_MAX_CURVE_POINTS = 25  # in the JSON file; enough to draw a curve
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row of the tables: a technique, how it is set, and how it is asked."""
+    """One row of the tables: a technique, its settings, and the options of its queries."""
 
     label: str
     technique: str
@@ -86,7 +86,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=base.RESULTS)
     args = parser.parse_args(argv)
     folders = base.find_sets(args.data, args.sets.split(",") if args.sets else None)
-    wanted = find_variants(args.variants.split(";") if args.variants else None)
+    variants = find_variants(args.variants.split(";") if args.variants else None)
     args.out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         folders = [
@@ -95,30 +95,30 @@ def main(argv: list[str] | None = None) -> None:
             else place_sites(folder, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-placed-"))))
             for folder in folders
         ]
-        from_the_air = [folder for folder in folders if base.infer_camera(folder.name) == "nadir"]
-        if len(from_the_air) > 1:
+        aerial_folders = [folder for folder in folders if base.infer_camera(folder.name) == "nadir"]
+        if len(aerial_folders) > 1:
             folders.append(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-joined-"))) / JOINED)
-            join_sets(from_the_air, folders[-1])
+            join_sets(aerial_folders, folders[-1])
         weights = base.REPOSITORY.parent / "shared" / "models" / "calc" / "model.onnx"
-        if ORIGINAL_CALC in wanted and weights.is_file():
+        if ORIGINAL_CALC in variants and weights.is_file():
             write_original_calc(
                 Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-cards-"))), weights
             )
         else:
-            wanted = [variant for variant in wanted if variant is not ORIGINAL_CALC]
+            variants = [variant for variant in variants if variant is not ORIGINAL_CALC]
         for folder in folders:
-            rows = [row for row in wanted if folder.name != JOINED or row.label in JOINED_ROWS]
+            rows = [row for row in variants if folder.name != JOINED or row.label in JOINED_ROWS]
             if rows and folder.name not in LEFT_OUT:
                 write_set(args.out / f"{folder.name}.json", folder, rows)
-    if args.out.resolve() == base.RESULTS:  # figures of other sets, or of a trial, do not travel
+    if args.out.resolve() == base.RESULTS:  # figures of other sets or of trials do not ship
         write_accuracy(sets_page.read_sets(args.out))
     left_out = {folder.name: LEFT_OUT[folder.name] for folder in folders if folder.name in LEFT_OUT}
     sets_page.write_page(args.out, left_out)
 
 
 def place_sites(folder: Path, work: Path) -> Path:
-    """Make a copy in `work` of a set that says in sites.csv where its pictures lie in those of their sites. It gets a
-    positions.csv: within a site positions are true to the pixel, where the sites lie on Earth is invented."""
+    """Copy a set to `work`, and write its positions.csv from its sites.csv, which has the pixel of each picture in the
+    picture of its site. Offsets within a site are exact to the pixel; the positions of the sites are invented."""
     out, sites, tags = work / folder.name, [], {}
     out.mkdir()
     for name in ("query", "ref", "ground_truth.csv"):
@@ -134,7 +134,7 @@ def place_sites(folder: Path, work: Path) -> Path:
 
 
 def join_sets(folders: list[Path], out: Path) -> None:
-    """Make one set of several: every query asks for its place among the places of all."""
+    """Join several sets into one, in which every query is matched against the places of all sets."""
     rows = []
     for folder in folders:
         for part in ("query", "ref"):
@@ -142,23 +142,23 @@ def join_sets(folders: list[Path], out: Path) -> None:
             for path in (folder / part).iterdir():
                 (out / part / f"{folder.name}_{path.name}").symlink_to(path.resolve())
         for row in base.read_csv(folder / "ground_truth.csv"):
-            named = ([f"{folder.name}_{name}" for name in (row.get(key) or "").split()] for key in _COLUMNS)
-            rows.append([*map(" ".join, named), row.get("status") or "ok"])
+            cells = ([f"{folder.name}_{name}" for name in (row.get(key) or "").split()] for key in _COLUMNS)
+            rows.append([*map(" ".join, cells), row.get("status") or "ok"])
     with open(out / "ground_truth.csv", "w", newline="") as handle:
         csv.writer(handle).writerows([(*_COLUMNS, "status"), *rows])
 
 
 def find_variants(labels: list[str] | None) -> list[Variant]:
-    """Return the variants with these labels (None: all). Raises UsageError for one that is not there."""
+    """Return the variants with these labels (None: all). Raises UsageError for an unknown label."""
     variants = {variant.label: variant for variant in VARIANTS}
     for label in labels or ():
         if label not in variants:
-            raise UsageError(f"There is no row `{label}`: use some of {'; '.join(variants)}.")
+            raise UsageError(f"There is no row `{label}`. The rows are: {'; '.join(variants)}.")
     return [variant for label, variant in variants.items() if labels is None or label in labels]
 
 
 def write_original_calc(cards: Path, weights: Path) -> None:
-    """Put CALC's published weights and a card for them where edgevpr looks for the models of a user."""
+    """Install CALC's published weights, with a model card, in `cards`, and let edgevpr read its models there."""
     (cards / "calc_original.onnx").symlink_to(weights.resolve())
     card = yaml.safe_load((base.REPOSITORY / "models" / "calc.yaml").read_text())
     card |= {"title": "CALC, the authors' weights", "file": "calc_original.onnx", "sha256": hash_model_file(weights)}
@@ -168,20 +168,20 @@ def write_original_calc(cards: Path, weights: Path) -> None:
     os.environ["EDGEVPR_MODELS"] = str(cards)
 
 
-def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
-    """Measure a set and write its file: rows measured before and not now stay as they are, each with its commit."""
+def write_set(path: Path, folder: Path, variants: list[Variant]) -> None:
+    """Measure a set and write its JSON file. Rows that are not measured now stay as they are, each with its commit."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
     rows: Row = sets_page.index_rows(base.read(path.stem, path.parent))
-    if not (wanted := [variant for variant in wanted if is_applicable(variant, folder, dataset)]):
+    if not (variants := [variant for variant in variants if is_applicable(variant, folder, dataset)]):
         return
-    for variant in wanted:
+    for variant in variants:
 
         def show_progress(items, total, label, variant=variant):
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
         technique = create(variant.technique, make_settings(variant, folder))
-        answers, not_done = answer_queries(technique, dataset, variant.options, show_progress)
-        result = summarise(technique, dataset, answers, variant.options, not_done)
+        answers, skipped = answer_queries(technique, dataset, variant.options, show_progress)
+        result = summarise(technique, dataset, answers, variant.options, skipped)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
             "precision_recall": base.thin_evenly(result.precision_recall, _MAX_CURVE_POINTS)
             if sets_page.has_curve(variant.label)
@@ -189,18 +189,18 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
             "commit": base.read_commit(),
             "cpu": provenance.read_cpu_model(),
         }
-    in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
-    for row, result in zip(in_order, add_pcu(read_result(row) for row in in_order), strict=True):
-        row |= asdict(result)  # the slowest encoder of all may be another now
+    ordered_rows = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
+    for row, result in zip(ordered_rows, add_pcu(map(read_result, ordered_rows)), strict=True):
+        row |= asdict(result)  # PCU depends on the slowest encoder, which may have changed
     run = base.describe_run()
     content = {"set": folder.name, "use": base.find_use(folder.name), "date": run["date"], "machine": run["machine"]}
-    content["ah_assumes"] = in_order[0]["ah_assumes"]
-    content["rows"] = [{key: value for key, value in row.items() if key != "ah_assumes"} for row in in_order]
+    content["ah_assumes"] = ordered_rows[0]["ah_assumes"]
+    content["rows"] = [{key: value for key, value in row.items() if key != "ah_assumes"} for row in ordered_rows]
     base.write_json(path.stem, content, path.parent)
 
 
 def is_applicable(variant: Variant, folder: Path, dataset: Dataset) -> bool:
-    """Return True if a set says what a variant is told of each query."""
+    """Return True if a set has the prior of each query (such as its heading) that a variant needs."""
     if not variant.options.known:
         return True
     spec = create(variant.technique, make_settings(variant, folder)).spec
@@ -212,14 +212,14 @@ def is_applicable(variant: Variant, folder: Path, dataset: Dataset) -> bool:
 
 
 def make_settings(variant: Variant, folder: Path) -> dict[str, str]:
-    """Return how a variant is used on a set: `cohog` looks down in those from the air; the thesis's has no camera."""
+    """Return the settings of a variant for a set: in aerial sets, `cohog` (not the thesis's) has a nadir camera."""
     looks_down = variant.technique == "cohog" and "matching" not in variant.settings
     return variant.settings | ({"camera": "nadir"} if looks_down and base.infer_camera(folder.name) == "nadir" else {})
 
 
 def write_accuracy(contents: list[Row]) -> None:
-    """Write the table of how well each technique recognises, by the way the camera looks, that travels with the
-    program: recall is that of the sets that are reported, what was accepted that of all."""
+    """Write the table that ships with edgevpr: the accuracy of each technique, by the direction of the camera. Recall
+    is of the sets marked `report`; counts of accepted matches are of all sets."""
     accuracy: dict[str, Row] = {"forward": {}, "nadir": {}}
     for camera, table in accuracy.items():
         sets = [row for row in contents if base.infer_camera(row["set"]) == camera and row["set"] != JOINED]
