@@ -1,4 +1,4 @@
-"""Shared by all benchmarks: where images and results lie, who made a figure, and tables, pages and pictures of rows."""
+"""What all benchmarks share: folders, JSON results and their provenance, Markdown tables, and plots."""
 
 import csv
 import json
@@ -19,18 +19,19 @@ from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-# The tests' tools (cameras on loopback, large maps, flights as processes), and the writing of networks.
+# Helpers of the tests (loopback cameras, large maps, flight processes), and the recipes that write networks.
 sys.path += [str(REPOSITORY / name) for name in ("tests", "tests/mavlink", "tests/runtime", "models/recipes")]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
 TUNING_SETS = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash", "thumbs_essex")
-AERIAL_PREFIXES = ("aerial_", "kite_", "sat_")  # how the names of such sets begin
+AERIAL_PREFIXES = ("aerial_", "kite_", "sat_")  # names of sets whose camera looks down
 Row = dict[str, Any]
 
 
 def run(main: Callable[[], object], opencv_threads: int | None = 1) -> None:
-    """Run a script on one thread of NumPy's library, whose number is read when NumPy is loaded, and with so many of
-    OpenCV (None: as edgevpr's commands run). What edgevpr cannot do ends it with a sentence."""
+    """Run a script's `main` on one OpenBLAS thread, and exit with its status. OpenBLAS reads its number of threads when
+    NumPy is loaded, so Python starts again if the number is not set. `opencv_threads`: None for OpenCV's default, as in
+    edgevpr's commands. An EdgevprError ends the script with its message."""
     if "OPENBLAS_NUM_THREADS" not in os.environ:
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         os.execv(sys.executable, sys.orig_argv)
@@ -44,7 +45,7 @@ def run(main: Callable[[], object], opencv_threads: int | None = 1) -> None:
 
 
 def describe_run() -> Row:
-    """Return the date, the commit and the machine of a measurement."""
+    """Return the date, commit and machine of a measurement."""
     versions = {"python": platform.python_version(), "numpy": np.__version__, "opencv": cv2.__version__}
     return {
         "date": provenance.format_date(),
@@ -55,7 +56,7 @@ def describe_run() -> Row:
 
 @cache
 def read_commit(repository: Path = REPOSITORY) -> str:
-    """Return the commit of a repository that is measured, and whether something has changed since."""
+    """Return the commit of a repository, followed by " with changes" if edgevpr/ or models/ differ from it."""
     if not shutil.which("git"):
         return "unknown"
     commands = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
@@ -65,14 +66,14 @@ def read_commit(repository: Path = REPOSITORY) -> str:
 
 
 def read_program_commit(repository: Path) -> str:
-    """Return what identifies the edgevpr of a repository: no other file changes it."""
+    """Return the last commit that changed edgevpr/ or models/: no other file changes the program."""
     command = ("git", "-C", str(repository), "log", "-1", "--format=%h", "--", "edgevpr", "models")
     last = subprocess.run(command, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
     return last + " with changes" * read_commit(repository).endswith("changes") or "unknown"
 
 
 def read(name: str, folder: Path = RESULTS) -> Row:
-    """Return the content of NAME.json; {} where it is not there."""
+    """Return the content of NAME.json; {} if there is no such file."""
     path = folder / f"{name}.json"
     return json.loads(path.read_text(), object_hook=restore_rows) if path.exists() else {}
 
@@ -94,8 +95,8 @@ def write_json(name: str, content: Row, folder: Path = RESULTS) -> None:
 
 
 def format_json(value: Any, longest: int = 2000) -> str:
-    """Return JSON with a line for each item of a value longer than `longest` characters; rows with the same keys become
-    columns and rows."""
+    """Return JSON text, with a line for each item of a value longer than `longest` characters. A list of rows with the
+    same keys becomes {"columns": ..., "rows": ...}."""
     text = json.dumps(value)
     if not isinstance(value, dict | list) or len(text) <= longest:
         return text
@@ -110,7 +111,7 @@ def format_json(value: Any, longest: int = 2000) -> str:
 
 
 def restore_rows(value: Row) -> Any:
-    """Return what `format_json` has kept as columns and rows."""
+    """Return the list of rows that `format_json` wrote as columns and rows; any other object unchanged."""
     is_table = value.keys() == {"columns", "rows"}
     return [dict(zip(value["columns"], row, strict=True)) for row in value["rows"]] if is_table else value
 
@@ -125,19 +126,19 @@ def round_floats(value: Any) -> Any:
 
 
 def format_origin(content: Row, command: str) -> str:
-    """Return the sentence that ends a page."""
+    """Return the last line of a page: commit, date, processor and command."""
     return f"Commit {content['commit']}, {content['date']}, {content['machine']['cpu']}. Made by `{command}`."
 
 
 def strip_title(doc: str, until: str | None = None) -> str:
-    """Return the docstring of a script for its page: without its first line, and without what follows `until`."""
+    """Return a script's docstring for its page: without the first paragraph, and only up to `until`."""
     text = doc.partition("\n\n")[2]
     return (text.partition(until)[0] if until else text).strip()
 
 
 def format_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], left: int = 1) -> str:
-    """Return rows as a Markdown table. A column is its heading and a template such as "{error[median_m]:.1f}"; what a
-    row lacks, or has as None, is "-"."""
+    """Return rows as a Markdown table. `columns` maps headings to templates such as "{error[median_m]:.1f}"; a value
+    that a row lacks, or that is None, is shown as "-"."""
     cells = [[format_cell(template, row) for template in columns.values()] for row in rows]
     return format_markdown_table(list(columns), cells, left)
 
@@ -158,7 +159,7 @@ def format_cell(template: str, row: Mapping[str, Any]) -> str:
 
 
 def find_use(name: str) -> str:
-    """Return whether parameters were chosen with a set (`tune`), or its figures are only reported (`report`)."""
+    """Return "tune" if parameters were chosen on a set, or "report" if its figures are only reported."""
     return "tune" if name in TUNING_SETS else "report"
 
 
@@ -168,28 +169,28 @@ def infer_camera(name: str) -> str:
 
 
 def find_sets(data: Path = DATA, names: Iterable[str] | None = None, camera: str | None = None) -> list[Path]:
-    """Return the folders of `data` that have a ground truth: all, those named, or those of a camera. Raises UsageError
-    where one is missing."""
+    """Return the folders of `data` that have a ground truth: all, those in `names`, or those of one camera. Raises
+    UsageError if one is missing."""
     folders = {path.parent.name: path.parent for path in sorted(data.glob("*/ground_truth.csv"))}
     wanted = list(folders) if names is None else list(names)
     missing = [name for name in wanted if name not in folders]
     if missing or not folders:
-        what = f"no set `{missing[0]}`" if missing else "no image sets (folders with a ground_truth.csv)"
-        raise UsageError(f"There are {what} in {data}: name the right folder with EDGEVPR_DATA.")
+        problem = f"no set `{missing[0]}`" if missing else "no image sets (folders with a ground_truth.csv)"
+        raise UsageError(f"Found {problem} in {data}: set EDGEVPR_DATA to the folder of the image sets.")
     return [folder for name, folder in folders.items() if name in wanted and camera in (None, infer_camera(name))]
 
 
 def run_edgevpr(*arguments: object) -> Any:
-    """Return what a command of edgevpr prints as JSON, by `--json`. Raises EdgevprError where it fails."""
+    """Run an edgevpr command with `--json`, and return its parsed output. Raises EdgevprError if it fails."""
     words = [sys.executable, "-m", "edgevpr", *map(str, arguments), "--json"]
     process = subprocess.run(words, stdout=subprocess.PIPE, text=True)
     if process.returncode:
-        raise EdgevprError(f"`{' '.join(words[2:])}` failed (see above): correct what it names.")
+        raise EdgevprError(f"`{' '.join(words[2:])}` failed: see its message above.")
     return json.loads(process.stdout)
 
 
 def make_panels(width_in: float, height_in: float, count: int, rows: int = 1, **shared: Any) -> tuple[Any, list[Any]]:
-    """Return a figure of so many inches with `count` panels in `rows`, each with a grid, and its axes."""
+    """Return a figure and its `count` axes, in `rows` rows, each with a grid. `shared`: arguments of `subplots`."""
     from matplotlib.figure import Figure  # not every benchmark draws
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
@@ -211,7 +212,7 @@ def save_figure(figure: Any, path: Path, dpi: int = 80) -> None:
 
 
 def measure_once(path: Path, measure: Callable[[], Any]) -> Any:
-    """Return the content of the file `path`; if there is none, measure and write it, so an interrupted run resumes."""
+    """Return the content of the file `path`; if it is missing, measure and write it, so an interrupted run resumes."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f"{path.name}.unfinished")
@@ -221,7 +222,7 @@ def measure_once(path: Path, measure: Callable[[], Any]) -> Any:
 
 
 def group_rows(rows: Iterable[Row], key: Callable[[Row], Any]) -> Iterator[tuple[Any, list[Row]]]:
-    """Yield the rows of each value of `key`, in the order of first rows."""
+    """Yield each value of `key` and its rows, in the order in which the values first occur."""
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)

@@ -1,8 +1,8 @@
-"""Every speed and memory figure in one run: `make bench` writes benchmarks/results/bench.md and bench.json.
+"""Measure every speed and memory figure: `make bench` writes benchmarks/results/bench.md and bench.json.
 
-Stages of a query of `cohog`, on one thread, and beside the scan the vote over all places. Frames, 640x480 grey, come
-from the generated scene and, where they are at hand, from image sets. Large maps are generated, their content random.
-The whole program is that of `bench_flight.py`. On a busy machine times do not hold.
+Times the stages of a `cohog` query on one thread, and compares its two-stage search with the vote over all places.
+Frames, 640x480 grey, come from the generated scene and, if available, from image sets. Large maps are generated, with
+random content. `bench_flight.py` measures the whole program. Times are not valid on a busy machine.
 """
 
 import statistics
@@ -56,7 +56,7 @@ COLUMNS = {
 
 
 def load_frames() -> list[np.ndarray]:
-    """Return generated frames and real ones, uint8 (480, 640)."""
+    """Return frames of the generated scene and of image sets, uint8 (480, 640)."""
     ground = cv2.cvtColor(make_scene(seed=3, width_m=220, depth_m=170).albedo, cv2.COLOR_BGR2GRAY)
     frames = [ground[top : top + FRAME_PX[1], left : left + FRAME_PX[0]] for top, left in ((100, 100), (500, 600))]
     for folder in sorted(DATA.glob("*/query")):
@@ -68,8 +68,7 @@ def load_frames() -> list[np.ndarray]:
 
 
 def time_call_s(function: Callable, *arguments: object) -> float:
-    """Return the wall time of a call right after another: the first pays for the caches and the memory that the others
-    left."""
+    """Return the wall time of the second of two calls: the first one fills the caches."""
     function(*arguments)
     start = time.perf_counter()
     function(*arguments)
@@ -77,7 +76,7 @@ def time_call_s(function: Callable, *arguments: object) -> float:
 
 
 def measure_encoding() -> Iterator[Row]:
-    """Encode each frame with both definitions of entropy."""
+    """Yield the median time to encode a frame, for each definition of entropy."""
     for entropy in ("shannon", "filled_bins"):
         technique = create("cohog", {"entropy": entropy})
         times_s = [time_call_s(technique.encode, picture) for picture in load_frames() for _ in range(ENCODE_REPEATS)]
@@ -85,9 +84,9 @@ def measure_encoding() -> Iterator[Row]:
 
 
 def measure_matching() -> Iterator[Row]:
-    """Compare one place in full, with the displacement vote. Each reference is another picture, as in a map."""
+    """Yield the median time to compare one place in full, by the displacement vote. As in a map, all places differ."""
     technique, pictures = create("cohog"), load_frames()
-    # Shifted copies stand in where there are too few pictures: the time does not depend on what they show.
+    # Shifted copies make up for missing pictures: the time does not depend on what they show.
     places = [technique.encode(np.roll(pictures[place % len(pictures)], place)) for place in range(REFERENCES)]
     query = technique.encode(pictures[0])
     repeats = range(MATCH_REPEATS)
@@ -97,7 +96,7 @@ def measure_matching() -> Iterator[Row]:
 
 @contextmanager
 def open_big_map(camera: str) -> Iterator[tuple[Technique, PlaceMap, PlaceIndex]]:
-    """Make and open a large map."""
+    """Make a map of `PLACES` places, and yield the technique, the open map and its index."""
     technique = create("cohog", {"camera": camera})
     with TemporaryDirectory() as folder:
         make_big_map(Path(folder) / "big.gpkg", technique.spec, PLACES)
@@ -106,27 +105,28 @@ def open_big_map(camera: str) -> Iterator[tuple[Technique, PlaceMap, PlaceIndex]
 
 
 def measure_queries() -> Iterator[Row]:
-    """Ask one query, encoding included, in a large map: the scan and the vote over the best places, looking ahead
-    against the vote over all (`exact_s`); looking down with what may be known beforehand, which `beside` tells."""
-    with open_big_map("forward") as large:
-        yield _time_query(large, "forward", "", NO_EXPECTATION)
-    with open_big_map("nadir") as large:
-        index = large[2]
-        # A map as it is flown, on parallel legs to and fro, with some sway.
+    """Time one query in a large map, encoding included: the scan, then the vote over the best places. The forward query
+    is also timed with the vote over all places (`exact_s`), the nadir one with the prior that `beside` names."""
+    with open_big_map("forward") as opened:
+        yield _time_query(opened, "forward", "", NO_EXPECTATION)
+    with open_big_map("nadir") as opened:
+        index = opened[2]
+        # Headings of a map that was flown on parallel legs, to and fro, with some sway.
         rng = np.random.default_rng(0)
         rotation_deg = (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360
-        near = index.find_within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), MAX_DISTANCE_M)
-        in_reach = f"{np.count_nonzero(near)} places within {MAX_DISTANCE_M:.0f} m"
-        yield _time_query(large, "nadir", "24 rotations", NO_EXPECTATION)
-        yield _time_query(large, "nadir, heading known", "3 rotations", Expectation(rotation_deg=rotation_deg))
-        yield _time_query(large, "nadir, in reach", in_reach, Expectation(in_reach=near))
-        yield _time_query(large, "nadir, both", f"{in_reach}, 3 rotations", Expectation(near, rotation_deg))
+        is_near = index.find_within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), MAX_DISTANCE_M)
+        near_text = f"{np.count_nonzero(is_near)} places within {MAX_DISTANCE_M:.0f} m"
+        yield _time_query(opened, "nadir", "24 rotations", NO_EXPECTATION)
+        yield _time_query(opened, "nadir, heading known", "3 rotations", Expectation(rotation_deg=rotation_deg))
+        yield _time_query(opened, "nadir, in reach", near_text, Expectation(in_reach=is_near))
+        yield _time_query(opened, "nadir, both", f"{near_text}, 3 rotations", Expectation(is_near, rotation_deg))
 
 
-def _time_query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, hints: str, expected: Expectation) -> Row:
-    (technique, place_map, index), picture = large, load_frames()[0]
+def _time_query(opened: tuple[Technique, PlaceMap, PlaceIndex], camera: str, prior: str, expected: Expectation) -> Row:
+    technique, place_map, index = opened
+    picture = load_frames()[0]
 
-    def answer(candidates: int | None) -> None:
+    def match(candidates: int | None) -> None:
         query = Query(
             technique=technique,
             descriptor=technique.encode(picture),
@@ -136,17 +136,17 @@ def _time_query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, hint
         )
         compare_places(query, scan_index(query), candidates, 0.0)
 
-    answer(technique.candidates)
+    match(technique.candidates)
     encode_s = statistics.median(time_call_s(technique.encode, picture) for _ in range(QUERY_REPEATS))
     two_stage_s, exact_s = [], []
-    for turn in range(QUERY_REPEATS):
-        two_stage_s.append(time_call_s(answer, technique.candidates))
-        if camera == "forward" and turn % 3 == 0:
-            exact_s.append(time_call_s(answer, None))
+    for repeat in range(QUERY_REPEATS):
+        two_stage_s.append(time_call_s(match, technique.candidates))
+        if camera == "forward" and repeat % 3 == 0:
+            exact_s.append(time_call_s(match, None))
     two_stage, exact = statistics.median(two_stage_s), statistics.median(exact_s) if exact_s else None
     return {
         "camera": camera,
-        "beside": hints,
+        "beside": prior,
         "candidates": technique.candidates,
         "encode_ms": 1000 * encode_s,
         "two_stage_ms": 1000 * two_stage,
@@ -164,7 +164,7 @@ def main() -> None:
 
 
 def format_page(result: Row) -> str:
-    """Return the page for people."""
+    """Return the results as Markdown."""
     ran_on = result["machine"]
     tables = {name: base.format_table(result[name], columns) for name, columns in COLUMNS.items()}
     return f"""# Speed and memory

@@ -1,10 +1,9 @@
-"""What a query costs an ARM core: the instructions of its parts, counted while an emulated Cortex-A53 runs them.
-`make bench-arm64` writes benchmarks/results/arm64.md and arm64.json, and the counts that `edgevpr profile` estimates
-ARM boards by.
+"""Count the instructions that each part of a query takes on an ARM core, an emulated Cortex-A53. `make bench-arm64`
+writes benchmarks/results/arm64.md and arm64.json, and the counts from which `edgevpr profile` estimates ARM boards.
 
-It needs Debian's packages qemu-user, debootstrap and gcc, and the registries of Debian and PyPI. Counts repeat to some
-thousandths; times do not. Only the program is emulated: its system calls are this machine's, and so are its files but
-for those of the Debian system that is made for it.
+Needs Debian's packages qemu-user, debootstrap and gcc, and access to the registries of Debian and PyPI. Counts repeat
+within a few thousandths; times do not. Only the program is emulated: it uses this machine's system calls, and its files
+except those of the Debian system that is made for it.
 """
 
 import json
@@ -28,11 +27,11 @@ from edgevpr.techniques import create
 
 HERE = Path(__file__).resolve().parent
 TOOLS = ("qemu-aarch64", "debootstrap", "gcc", "dpkg-deb")
-WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # what the parts import
+WHEELS = ("numpy", "opencv-python-headless", "psutil", "pyyaml")  # that the parts of the query import
 RELEASE = "bookworm"  # glibc 2.36, Python 3.11: that of Raspberry Pi OS 12
 PYTHON = "3.11"
-EMULATED_CPU = "cortex-a53"  # an instruction that a Raspberry Pi 3 or Zero 2 W has not ends the program
-# As Linux tells it of a Raspberry Pi Zero 2 W.
+EMULATED_CPU = "cortex-a53"  # an instruction that a Raspberry Pi 3 or Zero 2 W lacks ends the program
+# A core in /proc/cpuinfo of a Raspberry Pi Zero 2 W.
 _CPUINFO = """\
 processor\t: {}
 BogoMIPS\t: 38.40
@@ -43,7 +42,7 @@ CPU variant\t: 0x0
 CPU part\t: 0xd03
 CPU revision\t: 4
 """
-_GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28")  # of the wheels
+_GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28")  # versions that wheels are built for
 _COLUMNS = {
     "part": "{part}",
     "million instructions": "{millions:.2f}",
@@ -54,7 +53,8 @@ _COLUMNS = {
 def main() -> None:
     missing = [tool for tool in TOOLS if not shutil.which(tool)]
     if missing or os.geteuid():
-        sys.exit(f"bench_arm64: as root, install qemu-user, debootstrap and gcc ({' '.join(missing)} is not there).")
+        lacks = ", ".join(missing) or "no tool"
+        sys.exit(f"bench_arm64: run as root, with qemu-user, debootstrap and gcc installed (missing: {lacks}).")
     with TemporaryDirectory(prefix="edgevpr-arm64-") as folder:
         work = Path(folder)
         build_tools(work)
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def build_tools(work: Path) -> None:
-    """Make a Debian system for aarch64 with Python, the wheels that edgevpr imports, and the plug-in that counts."""
+    """Make a Debian system for aarch64 with Python, the wheels that edgevpr imports, and the counting plug-in."""
     make_system(work / "system")
     names = [*(f"manylinux_{version}" for version in _GLIBC), "manylinux2014"]
     tags = ["--only-binary=:all:", "--implementation=cp", f"--python-version={PYTHON}"]
@@ -81,7 +81,7 @@ def build_tools(work: Path) -> None:
 
 
 def make_system(folder: Path) -> None:
-    """Make a Debian system for aarch64 with Python in a new folder, from Debian's packages; needs root for that."""
+    """Make a Debian system for aarch64 with Python in a new folder, from Debian's packages (needs root)."""
     packages = "python3,libsqlite3-0,libstdc++6"
     run_command(
         ["debootstrap", "--foreign", "--arch=arm64", "--variant=minbase", f"--include={packages}", RELEASE, str(folder)]
@@ -89,49 +89,48 @@ def make_system(folder: Path) -> None:
     for archive in sorted((folder / "var/cache/apt/archives").glob("*.deb")):
         run_command(["dpkg-deb", "-x", str(archive), str(folder)])
         archive.unlink()
-    # QEMU looks for every path here first: devices and settings are to be this machine's.
+    # QEMU looks up every path here first. Without these folders it finds this machine's devices and settings.
     for path in folder.iterdir():
         if path.name not in ("usr", "lib", "bin", "sbin"):
             shutil.rmtree(path)
-    # Libraries look here for what the processor can do: not that of this machine.
+    # Libraries read the features of the processor here: give them the emulated processor's.
     (folder / "proc").mkdir()
     (folder / "proc/cpuinfo").write_text("\n".join(_CPUINFO.format(number) for number in range(4)))
 
 
 def run_command(argv: Sequence[str], env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:
-    """Run a command, with `env` beside the variables of this process; one that fails ends the program with its
-    output."""
-    done = subprocess.run(argv, capture_output=True, text=True, env={**os.environ, **(env or {})})
-    if done.returncode:
-        sys.exit(f"{' '.join(argv[:4])} ... failed: {done.stdout[-2000:]}{done.stderr[-2000:]}")
-    return done
+    """Run a command with `env` added to the environment. If it fails, exit with the end of its output."""
+    process = subprocess.run(argv, capture_output=True, text=True, env={**os.environ, **(env or {})})
+    if process.returncode:
+        sys.exit(f"{' '.join(argv[:4])} ... failed: {process.stdout[-2000:]}{process.stderr[-2000:]}")
+    return process
 
 
 def count_instructions(work: Path, maps: list[str]) -> list[dict[str, Any]]:
-    """Run the parts under emulation. Returns for each its name (`part`) and its `instructions`."""
+    """Run the parts under emulation, and return the name (`part`) and the number of `instructions` of each."""
     argv = ["qemu-aarch64", "-cpu", EMULATED_CPU, "-L", str(work / "system"), "-plugin", str(work / "count.so")]
     argv += [str(work / f"system/usr/bin/python{PYTHON}"), str(HERE / "arm64" / "work.py"), *maps]
-    done = run_command(argv, {"PYTHONPATH": f"{work / 'site'}:{HERE.parent}"})
-    marks = [int(line) for line in done.stderr.splitlines() if line.isdigit()]
-    names = done.stdout.splitlines()
-    if len(marks) != 2 * len(names):
-        raise RuntimeError(f"{len(marks)} marks of {len(names)} parts: {done.stderr}")
-    parts = zip(names, marks[::2], marks[1::2], strict=True)
+    process = run_command(argv, {"PYTHONPATH": f"{work / 'site'}:{HERE.parent}"})
+    counts = [int(line) for line in process.stderr.splitlines() if line.isdigit()]  # before and after each part
+    names = process.stdout.splitlines()
+    if len(counts) != 2 * len(names):
+        raise RuntimeError(f"{len(counts)} counts for {len(names)} parts (two each expected): {process.stderr}")
+    parts = zip(names, counts[::2], counts[1::2], strict=True)
     return [{"part": name, "instructions": after - before} for name, before, after in parts]
 
 
 def format_page(result: dict[str, Any]) -> str:
-    """Return the page for people."""
+    """Return the results as Markdown."""
     machine, places = result["machine"], counted.LARGE_MAP_PLACES
     mips = load_board("rpi-zero-2w").benchmark_score.arm64_mips
     millions = {row["part"]: row["instructions"] / 1e6 for row in result["parts"]}
     rows = [{"part": part, "millions": count, "zero_s": count / mips} for part, count in millions.items()]
     return f"""# What a query costs an ARM core
 
-Made by `make bench-arm64` on {result["date"]}, commit {result["commit"]}: {places} places, and a picture in which
-nearly every region is good. Counted while QEMU ran a Cortex-A53, with NumPy {machine["numpy"]} and OpenCV
-{machine["opencv"]} for aarch64. The last column divides by the {mips:g} million instructions a second of
-`profiles/rpi-zero-2w.yaml`.
+Made by `make bench-arm64` on {result["date"]}, commit {result["commit"]}, with a map of {places} places and a
+picture whose regions are nearly all used. Instructions were counted while QEMU emulated a Cortex-A53, with NumPy
+{machine["numpy"]} and OpenCV {machine["opencv"]} for aarch64. The last column divides them by the {mips:g} million
+instructions per second of `profiles/rpi-zero-2w.yaml`.
 
 {base.format_table(rows, _COLUMNS)}
 """

@@ -1,10 +1,10 @@
-"""What memorable maps are worth: every image set with and without the gate.
+"""Measure the salience gate: match every image set with and without it.
 
 python benchmarks/bench_salience.py [--sets A,B]
 
-Needs the extra `train`, and for the staticity a detector (see `detectors`). For every set the network of matchability
-is fitted to all other sites, so that no figure comes from a network that has seen its site. Writes salience.json
-and salience.md into benchmarks/results/.
+Needs the extra `train`, and a detector for the staticity (see `detectors`). For every set, the memorability network is
+fitted to all other sites, so that no figure comes from a network that has seen the site. Writes salience.json and
+salience.md into benchmarks/results/.
 """
 
 import argparse
@@ -45,43 +45,43 @@ GATES = {
 }
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
-# The answer to a query: the slots of the places, best first, their scores, and which slots are right or to be ignored.
+# The answer to a query: slots of the places, best first; their scores; masks of the right and of the ignored slots.
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", metavar="A,B", help="(default: all)")
+    parser.add_argument("--sets", metavar="A,B", help="sets to match, comma-separated (default: all)")
     args = parser.parse_args()
     names = args.sets.split(",") if args.sets else None
     folders = base.find_sets(names=names)
     with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
         os.environ["EDGEVPR_MODELS"] = temporary
-        unseen = fit_networks([item.name for item in folders], Path(temporary))
+        unseen = fit_networks([folder.name for folder in folders], Path(temporary))
         detector = None
         if detectors.FILE.is_file():
-            detectors.write_card(Path(temporary))
+            detectors.install_detector(Path(temporary))
             detector = Detector(load_card(detectors.NAME))
         speed = measure_frame_times_ms(f"without_{folders[0].name}", detector)
         rows = []
         for folder in folders:
             memorability = Memorability(load_card(f"without_{folder.name}"))
             dataset = walks.load_matched_set(folder)
-            queries = [item.path for item in dataset.queries]
+            queries = [query.path for query in dataset.queries]
             places = list_images(folder / "ref")
             paths = progress([*queries, *places], len(queries) + len(places), f"{folder.name}: salience")
             scores = {path: compute_scores_by_gate(path, memorability, detector) for path in paths}
-            passing = {gate: find_passing([scores[path] for path in places], gate) for gate in GATES}
+            kept = {gate: find_passing([scores[path] for path in places], gate) for gate in GATES}
             for technique in TECHNIQUES:
                 answers = answer_queries(technique, dataset)
-                rows += measure_gates(folder.name, technique, answers, [scores[path] for path in queries], passing)
+                rows += measure_gates(folder.name, technique, answers, [scores[path] for path in queries], kept)
     result = {**base.describe_run(), "speed": speed, "unseen": unseen, "gate": rows}
     base.write("salience", result, format_page(result))
 
 
 def fit_networks(names: list[str], models: Path) -> dict[str, dict[str, float | None]]:
-    """For every set fit a network to all other sites, and write it with its card; return how it does on sites that it
-    has not seen, on generated changes and on real queries."""
+    """For every set, fit a network to all other sites, and write it with its card. Returns the ROC AUC on each site
+    that was left out, on `generated` changes and on `real` queries."""
     learnt = [folder for folder in base.find_sets() if folder.name not in NOT_LEARNT]
     sites = [site_of(folder.name, label_site(folder, infer_camera(folder.name) == "nadir", _SEED)) for folder in learnt]
     for name in names:
@@ -91,7 +91,7 @@ def fit_networks(names: list[str], models: Path) -> dict[str, dict[str, float | 
 
 
 def measure_frame_times_ms(network: str, detector: Detector | None) -> dict[str, float]:
-    """Return the median milliseconds of a frame of 640x480, one thread."""
+    """Return the median time (ms) of the criteria on a frame of 640x480, one thread."""
     picture = cv2.resize(read_image(list_images(DATA / "aerial_swindale" / "ref")[0]), (640, 480))
     memorability = Memorability(load_card(network))
     methods = {
@@ -102,16 +102,16 @@ def measure_frame_times_ms(network: str, detector: Detector | None) -> dict[str,
         name = f"all three, {detectors.NAME}"
         methods[name] = lambda: compute_scores(picture, memorability, detector.is_static(picture))
     times_ms: dict[str, list[float]] = {name: [] for name in methods}
-    for _ in range(31):  # in turn, so that a busy moment hits all of them; the first round only warms
+    for _ in range(31):  # in turn, so that a busy moment affects all; the first round is a warm-up
         for name, method in methods.items():
             start = time.perf_counter()
             method()
             times_ms[name].append(1e3 * (time.perf_counter() - start))
-    return {name: float(np.median(item[1:])) for name, item in times_ms.items()}
+    return {name: float(np.median(values_ms[1:])) for name, values_ms in times_ms.items()}
 
 
 def answer_queries(name: str, dataset: Dataset) -> list[Answer]:
-    """Map the references and ask all queries."""
+    """Map the references with a technique, and return its answers to all queries."""
     site, answers = dataset.ref_dir.parent.name, []
     with walks.open_walk(list_images(dataset.ref_dir), name, infer_camera(site) == "nadir") as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
@@ -122,24 +122,24 @@ def answer_queries(name: str, dataset: Dataset) -> list[Answer]:
     return answers
 
 
-def score_answers(answers: list[Answer], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Answer every query from the places that are kept, bool (N,): (score of the best, is it right)."""
-    best, is_right = [], []
+def score_answers(answers: list[Answer]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the score of the best place that is not ignored, and whether it is right, for each query, (Q,) each."""
+    best_scores, is_right = [], []
     for slots, scores, right, ignored in answers:
-        counts = places[slots] & ~ignored[slots]
-        best.append(float(scores[counts][0]) if counts.any() else 0.0)
+        counts = ~ignored[slots]
+        best_scores.append(float(scores[counts][0]) if counts.any() else 0.0)
         is_right.append(bool(right[slots[counts][0]]) if counts.any() else False)
-    return np.array(best), np.array(is_right)
+    return np.array(best_scores), np.array(is_right)
 
 
 def measure_gates(
-    name: str, technique: str, answers: list[Answer], scores: list[dict[str, Salience]], passing: dict[str, np.ndarray]
+    name: str, technique: str, answers: list[Answer], scores: list[dict[str, Salience]], kept: dict[str, np.ndarray]
 ) -> Iterable[Row]:
-    """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. All references
-    stay, as in the thesis. `auc` is that of the thesis's count (a query that is discarded is a true negative),
-    `recall_strict` counts it as missed. `true_discarded` of the `queries` were matched rightly without the gate,
-    `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
-    score, is_right = score_answers(answers, np.ones(len(answers[0][2]), bool))
+    """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. The map has all
+    references, as in the thesis. `auc` counts a discarded query as a true negative, as the thesis does; `recall_strict`
+    counts it as a miss. Of the discarded queries, `true_discarded` were matched rightly without the gate and
+    `false_discarded` wrongly. `places` is the share of the references that pass the gate, by the masks `kept`."""
+    score, is_right = score_answers(answers)
     for gate in GATES:
         passes = find_passing(scores, gate)
         precision, recall = metrics.precision_recall(score[passes], is_right[passes])
@@ -153,22 +153,22 @@ def measure_gates(
             "queries": len(passes),
             "true_discarded": int((is_right & ~passes).sum()),
             "false_discarded": int((~is_right & ~passes).sum()),
-            "places": float(passing[gate].mean()),
+            "places": float(kept[gate].mean()),
         }
 
 
 def compute_scores_by_gate(path: Path, memorability: Memorability, detector: Detector | None) -> dict[str, Salience]:
-    """Return the scores of a picture under each gate. A criterion alone knows nothing of what moves, but staticity."""
+    """Return the scores of a picture by gate. Only the gates with the staticity criterion use the detector."""
     picture = read_image(path)
-    still = compute_scores(picture, memorability)
+    without_detector = compute_scores(picture, memorability)
     if detector is None:
-        return dict.fromkeys(GATES, still)
-    moving = compute_scores(picture, memorability, detector.is_static(picture))
-    return {gate: moving if gate in ("all three", "staticity") else still for gate in GATES}
+        return dict.fromkeys(GATES, without_detector)
+    with_detector = compute_scores(picture, memorability, detector.is_static(picture))
+    return {gate: with_detector if gate in ("all three", "staticity") else without_detector for gate in GATES}
 
 
 def find_passing(scores: list[dict[str, Salience]], gate: str) -> np.ndarray:
-    """Return which pictures pass a gate, by their scores, bool (N,)."""
+    """Return which pictures pass a gate by their scores, bool (N,)."""
     return np.array([judge_scores(score[gate], GATES[gate]).reason is None for score in scores])
 
 
@@ -185,7 +185,7 @@ _GATE = {
 
 
 def format_page(result: Row) -> str:
-    """Return the page for people."""
+    """Return the results as Markdown."""
     rows = result["gate"]
     unseen = [{"pictures": pictures, **by_site} for pictures, by_site in result["unseen"].items()]
     columns = {"pictures": "{pictures}", **{name: f"{{{name}:.2f}}" for name in list(unseen[0])[1:]}}
@@ -195,7 +195,7 @@ def format_page(result: Row) -> str:
     shares = {(row["gate"], row["set"]): row["places"] for row in rows}
     speed = [{"what": what, "ms": t_ms} for what, t_ms in result["speed"].items()]
     sizes = [{"gate": gate, **{name: shares[gate, name] for name in sets}} for gate in GATES if gate != "none"]
-    return f"""# Memorable maps: what the gate and the choice of places are worth
+    return f"""# Memorable maps: what the gate and the choice of places gain
 
 Made by `python benchmarks/bench_salience.py`, {result["date"]}, commit {result["commit"]}, {result["machine"]["cpu"]}.
 Thresholds: memorability {FULL_GATE.memorability:g}, staticity {FULL_GATE.staticity:g}, entropy {FULL_GATE.entropy:g}.
@@ -204,20 +204,19 @@ Thresholds: memorability {FULL_GATE.memorability:g}, staticity {FULL_GATE.static
 
 {base.format_table(speed, {"what": "{what}", "ms": "{ms:.1f}"})}
 
-## Is it told which frames are found again? On sites that were left out; 0.50 is chance
+## Does memorability predict which frames are matched? ROC AUC on sites left out of the fit (chance: 0.50)
 
 {base.format_table(unseen, columns)}
 
 ## With and without the gate
 
-recall@1 and AUC are those of the thesis's count: a query that is discarded is a true negative. *strict*: it is a miss.
-*right* and *wrong* count the discarded queries that would have been matched so. The map has all references. No query is
-discarded of
-{", ".join(unchanged) or "any set"}: there all figures are those without a gate.
+recall@1 and AUC count a discarded query as a true negative, as the thesis does; *strict* counts it as a miss. *right*
+and *wrong*: discarded queries that would have been matched rightly and wrongly. The map has all references. The gate
+discards no query of {", ".join(unchanged) or "any set"}: there all figures are those without a gate.
 
 {base.format_table([row for row in rows if (row["set"], row["technique"]) in discards], _GATE)}
 
-The size of a map that is built through the gate, before its gaps are filled: share of the references kept
+Size of a map that is built with the gate, before coverage gaps are filled: share of the references kept
 
 {base.format_table(sizes, {"gate": "{gate}", **{name: f"{{{name}:.0%}}" for name in sets}})}
 

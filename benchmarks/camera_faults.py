@@ -1,8 +1,9 @@
-"""A flight of an hour whose camera misbehaves: `python benchmarks/camera_faults.py [SECONDS]`.
+"""Fly for an hour with a faulty camera: `python benchmarks/camera_faults.py [SECONDS]`.
 
-A simulated plane without GPS flies laps over generated ground. Its camera sends MPEG-TS with sound by TCP and, for 6
-to 20 s at a time and by a fixed seed, does one thing that cameras were seen to do, then is well for as long. Each
-accepted match and each position that the autopilot was sent is compared with where the plane was then.
+A simulated plane without GPS flies laps over generated ground. Its camera sends MPEG-TS with sound over TCP. It works
+well for 6 to 20 s, then has a fault for 6 to 20 s, and so on, in an order that follows from a fixed seed; real cameras
+showed all these faults. Each accepted match, and each position sent to the autopilot, is compared with the position of
+the plane at that time.
 """
 
 import json
@@ -51,13 +52,13 @@ CENTRE_M = (205.0, 210.0)
 RADIUS_M = 90.0
 HEIGHT_M = 80.0
 SPEED_M_S = 12.0
-GPS_DURATION_S = 20.0  # of the flight with GPS
+GPS_DURATION_S = 20.0  # from take-off: the flight goes on without GPS
 MAX_ERROR_SIGMAS = 3.0
 CAMERA = Camera(width=480, height=360, focal_px=370.0)
 NO_FAULT = "well"
 STAMP_SPEEDS = {"slow stamps": 0.7, "fast stamps": 1.3}
 USUAL_STREAM = ("libx264", "yuv420p")
-STREAMS = {"ten bits": ("libx264", "yuv420p10le"), "another codec": ("libx265", "yuv420p")}  # of a new connection
+STREAMS = {"ten bits": ("libx264", "yuv420p10le"), "another codec": ("libx265", "yuv420p")}  # of the next connection
 FAULTS = (
     *("frozen, with noise", "frozen, with a clock", "loop of two seconds", "three seconds late", "mirrored"),
     *("side by side", "sound only", "silent", "gone", "garbage", *STAMP_SPEEDS, *STREAMS),
@@ -65,11 +66,13 @@ FAULTS = (
 
 
 class FaultyCamera(threading.Thread):
-    """Sends what `take` returns through a port of this machine, as `fault` says."""
+    """A camera that streams the images of `take` from a local TCP port, with the current `fault`."""
 
     def __init__(self, take: Callable[[], Image]) -> None:
         super().__init__(daemon=True)
-        self._take, self.fault, self.connections = take, NO_FAULT, 0
+        self._take = take
+        self.fault = NO_FAULT
+        self.connections = 0
         self._server = socket.create_server(("127.0.0.1", 0))
         self.uri = f"tcp://127.0.0.1:{self._server.getsockname()[1]}"
         self._last: deque[Image] = deque(maxlen=3 * RATE_HZ)
@@ -84,6 +87,7 @@ class FaultyCamera(threading.Thread):
                     self._send(connection.makefile("wb", buffering=0))
 
     def _send(self, sink: Any) -> None:
+        """Stream to one connection, until the camera is gone or the fault needs another kind of stream."""
         codec, pixels = stream = STREAMS.get(self.fault, USUAL_STREAM)
         options = {"max_interleave_delta": "1", "flush_packets": "1"}
         with av.open(sink, "w", format="mpegts", container_options=options) as container:
@@ -93,12 +97,12 @@ class FaultyCamera(threading.Thread):
             video.gop_size, video.max_b_frames, video.bit_rate = 5, 0, 3_000_000
             video.codec_context.time_base = video.time_base = Fraction(1, 90_000)
             video.options = {"preset": "ultrafast", "tune": "zerolatency", "x265-params": "log-level=error"}
-            stamp_s, sound_s, at_s = 0.0, 0.0, time.monotonic()
+            stamp_s, sound_s, last_s = 0.0, 0.0, time.monotonic()
             while self.fault != "gone" and STREAMS.get(self.fault, USUAL_STREAM) == stream:
                 time.sleep(1 / RATE_HZ)
                 now_s = time.monotonic()
-                stamp_s += STAMP_SPEEDS.get(self.fault, 1.0) * (now_s - at_s)
-                at_s = now_s
+                stamp_s += STAMP_SPEEDS.get(self.fault, 1.0) * (now_s - last_s)
+                last_s = now_s
                 image = self._apply_fault(self._take())
                 if self.fault == "garbage":
                     sink.write(self._noise.bytes(20_000))
@@ -113,7 +117,7 @@ class FaultyCamera(threading.Thread):
                     sound_s += 1152 / 48000
 
     def _apply_fault(self, image: Image) -> Image:
-        """Return what is sent in place of the picture that was taken."""
+        """Return the image to send in place of the image taken."""
         is_still = self.fault.startswith(("frozen", "loop"))
         if not is_still or len(self._last) < 3 * RATE_HZ:
             self._last.append(image)
@@ -122,9 +126,9 @@ class FaultyCamera(threading.Thread):
                 noise = self._noise.normal(0, 3, image.shape)
                 return np.clip(self._last[-1] + noise, 0, 255).astype(np.uint8)
             case "frozen, with a clock":
-                clock = self._last[-1].copy()
-                cv2.putText(clock, f"{time.time():.2f}", (10, 40), 0, 1.0, (255, 255, 255), 2)
-                return clock
+                frozen = self._last[-1].copy()
+                cv2.putText(frozen, f"{time.time():.2f}", (10, 40), 0, 1.0, (255, 255, 255), 2)
+                return frozen
             case "loop of two seconds":
                 self._last.rotate(-1)
                 return self._last[0]
@@ -133,50 +137,51 @@ class FaultyCamera(threading.Thread):
             case "mirrored":
                 return cv2.flip(image, 1)
             case "side by side":
-                eye = cv2.resize(image, (CAMERA.width // 2, CAMERA.height))
-                return np.hstack([eye, np.roll(eye, -6, axis=1)])
+                half = cv2.resize(image, (CAMERA.width // 2, CAMERA.height))
+                return np.hstack([half, np.roll(half, -6, axis=1)])
         return image
 
 
 class Lap:
-    """The plane on its laps: `truth` has where it was, and `sent` what its autopilot was sent, by our clock."""
+    """A plane that flies laps. `truth`: its positions, (t_s, east_m, north_m); `sent`: the positions sent to its
+    autopilot, (t_s, lat_deg, lon_deg, standard deviation in metres). Times are those of this machine's clock."""
 
     def __init__(self, seconds: float) -> None:
-        turn = SPEED_M_S / RADIUS_M
+        turn_rate_rad_s = SPEED_M_S / RADIUS_M
         roll_deg = math.degrees(math.atan(SPEED_M_S**2 / RADIUS_M / 9.80665))
         track = []
         for t_s in np.arange(0.0, seconds, 0.5).tolist():
-            pose = self._compute_pose(t_s * turn)
-            place = to_position(pose)
-            location = {"lat_deg": place.lat_deg, "lon_deg": place.lon_deg, "alt_m": place.alt_m, "height_m": HEIGHT_M}
+            pose = self._compute_pose(t_s * turn_rate_rad_s)
+            position = to_position(pose)
+            location = {name: getattr(position, name) for name in ("lat_deg", "lon_deg", "alt_m")}
             angles = {"heading_deg": pose.heading_deg, "roll_deg": roll_deg, "pitch_deg": 0.0}
-            track.append(TrueState(**location, **angles, t_s=t_s))
+            track.append(TrueState(**location, **angles, height_m=HEIGHT_M, t_s=t_s))
         self.controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=GPS_DURATION_S)
         self.truth: list[tuple[float, float, float]] = []
         self.sent: list[tuple[float, float, float, float]] = []
         self._receive, self.controller.receive = self.controller.receive, self._handle_message
 
     def _record_truth(self) -> TrueState:
-        """Keep where the plane is now, and return it."""
+        """Record the present position of the plane, and return its state."""
         state = self.controller.brain.truth
         self.truth.append((time.monotonic(), *to_metres(state.lat_deg, state.lon_deg)))
         return state
 
-    def pose(self) -> CameraPose:
-        """Return where the camera is now."""
+    def record_pose(self) -> CameraPose:
+        """Record the present position of the plane, and return the pose of its camera."""
         state = self._record_truth()
         east_m, north_m = to_metres(state.lat_deg, state.lon_deg)
         angles = {"heading_deg": state.heading_deg, "roll_deg": state.roll_deg}
         return CameraPose(east_m=east_m, north_m=north_m, height_m=HEIGHT_M, **angles)
 
     def measure_error_m(self, t_s: float, lat_deg: float, lon_deg: float) -> float:
-        """Return how far a position is from where the plane was at `t_s`."""
+        """Return the distance of a position from that of the plane at `t_s`."""
         truth = np.array(sorted(self.truth))
         true_m = [np.interp(t_s, truth[:, 0], truth[:, axis]) for axis in (1, 2)]
         return math.dist(true_m, to_metres(lat_deg, lon_deg))
 
     def _handle_message(self, message: Any) -> list:
-        self._record_truth()  # a camera that is gone asks for no pose
+        self._record_truth()  # while the camera is gone, no picture records it
         if message.get_type() == "COMMAND_INT" and message.command == POSITION_FIX:
             fix = time.monotonic() - message.param2, message.x / 1e7, message.y / 1e7, message.param3
             self.sent.append(fix)
@@ -190,48 +195,49 @@ class Lap:
 
 
 def fly(seconds: float, folder: Path) -> base.Row:
-    """Make the map, fly, and return what was seen."""
+    """Make the map, fly for `seconds`, and return the results."""
     scene = make_scene(SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
     flight = replace(plan_mapping_flight(SEED), camera=CAMERA)
     list(write_flight(folder, scene, flight))
     fov_deg = math.degrees(2 * math.atan(CAMERA.width / 2 / CAMERA.focal_px))
-    look = ("--camera", "nadir", "--fov-deg", f"{fov_deg:.2f}")
+    lens = ("--camera", "nadir", "--fov-deg", f"{fov_deg:.2f}")
     program, place_map, log = [sys.executable, "-m", "edgevpr"], folder / "map.gpkg", folder / "flight.jsonl"
     subprocess.run(
-        [*program, "map", "build", place_map, "--images", folder / "images", *look, "--no-calibrate"], check=True
+        [*program, "map", "build", place_map, "--images", folder / "images", *lens, "--no-calibrate"], check=True
     )
-    ground, lap, rng = light_scene(scene, flight.light, SEED), Lap(seconds + 60), np.random.default_rng(SEED)
-    camera = FaultyCamera(lambda: photograph(ground, scene.metres_per_pixel, lap.pose(), CAMERA, flight.light, rng))
+    light, rng = flight.light, np.random.default_rng(SEED)
+    ground, lap = light_scene(scene, light, SEED), Lap(seconds + 60)
+    camera = FaultyCamera(lambda: photograph(ground, scene.metres_per_pixel, lap.record_pose(), CAMERA, light, rng))
     camera.start()
     stop, port = threading.Event(), free_port()
     threading.Thread(target=serve, args=(lap.controller, f"udpin:127.0.0.1:{port}", stop), daemon=True).start()
-    link = ("--link", f"udpout:127.0.0.1:{port}", "--log", log)
+    link_flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log)
     with open(folder / "errors.txt", "w") as errors:
-        command = [*program, "run", "--map", place_map, "--source", camera.uri, *look, *link]
+        command = [*program, "run", "--map", place_map, "--source", camera.uri, *lens, *link_flags]
         run = subprocess.Popen(command, stderr=errors)
-    phases, memory_mb, untried = [], [], []
-    dice, end_s = random.Random(SEED), time.monotonic() + seconds
+    phases, memory_mb, remaining = [], [], []
+    fault_rng, end_s = random.Random(SEED), time.monotonic() + seconds
     while time.monotonic() < end_s and run.poll() is None:
-        untried = untried or dice.sample(FAULTS, len(FAULTS))
-        for fault in (NO_FAULT, untried.pop()):
+        remaining = remaining or fault_rng.sample(FAULTS, len(FAULTS))
+        for fault in (NO_FAULT, remaining.pop()):
             camera.fault = fault
             phases.append((time.monotonic(), fault))
-            time.sleep(GPS_DURATION_S + 10 if len(phases) == 1 else dice.uniform(6, 20))
+            time.sleep(GPS_DURATION_S + 10 if len(phases) == 1 else fault_rng.uniform(6, 20))
         if run.poll() is None:
             memory_mb.append(psutil.Process(run.pid).memory_info().rss / 1e6)
-    code, asked_s = run.poll(), time.monotonic()
+    exit_code, stop_s = run.poll(), time.monotonic()
     run.terminate()
     with suppress(subprocess.TimeoutExpired):
         run.wait(20)
-    ended = {"ended_early": code, "end_s": time.monotonic() - asked_s, "connections": camera.connections}
+    run_end = {"ended_early": exit_code, "end_s": time.monotonic() - stop_s, "connections": camera.connections}
     run.kill()
     stop.set()
     rows = summarise_faults(lap, phases, log)
-    return {**base.describe_run(), **ended, "seconds": seconds, "memory_mb": memory_mb, "rows": rows}
+    return {**base.describe_run(), **run_end, "seconds": seconds, "memory_mb": memory_mb, "rows": rows}
 
 
 def summarise_faults(lap: Lap, phases: list[tuple[float, str]], log: Path) -> list[base.Row]:
-    """Return a row for each fault: how often it came, its queries, and the largest errors of matches and positions."""
+    """Return a row for each fault: how often it occurred, its queries, and the errors of matches and sent positions."""
     counts = dict.fromkeys(("queries", "accepted", "accepted_wrong", "sent", "sent_wrong"), 0)
     rows = {fault: {"fault": fault, **counts, "accepted_m": 0.0, "sent_m": 0.0} for fault in (NO_FAULT, *FAULTS)}
 
@@ -239,10 +245,10 @@ def summarise_faults(lap: Lap, phases: list[tuple[float, str]], log: Path) -> li
         return rows[next((fault for begin_s, fault in reversed(phases) if begin_s <= t_s), NO_FAULT)]
 
     def count_position(kind: str, t_s: float, lat_deg: float, lon_deg: float, sd_m: float) -> None:
-        row, off_m = find_row(t_s), lap.measure_error_m(t_s, lat_deg, lon_deg)
+        row, error_m = find_row(t_s), lap.measure_error_m(t_s, lat_deg, lon_deg)
         row[kind] += 1
-        row[f"{kind}_wrong"] += off_m > MAX_ERROR_SIGMAS * sd_m
-        row[f"{kind}_m"] = max(row[f"{kind}_m"], off_m)
+        row[f"{kind}_wrong"] += error_m > MAX_ERROR_SIGMAS * sd_m
+        row[f"{kind}_m"] = max(row[f"{kind}_m"], error_m)
 
     for line in map(json.loads, log.read_text().splitlines()):
         if line["kind"] == "query":
@@ -258,28 +264,29 @@ def summarise_faults(lap: Lap, phases: list[tuple[float, str]], log: Path) -> li
 
 
 def format_page(result: base.Row) -> str:
+    """Return the results as Markdown."""
     columns = {
         "camera": "{fault}",
         "times": "{times}",
         "queries": "{queries}",
         "accepted": "{accepted}",
         f"beyond {MAX_ERROR_SIGMAS:.0f} sigma": "{accepted_wrong}",
-        "farthest off, m": "{accepted_m:.1f}",
+        "largest error, m": "{accepted_m:.1f}",
         "sent": "{sent}",
-        f"of these beyond {MAX_ERROR_SIGMAS:.0f} sigma": "{sent_wrong}",
-        "farthest sent, m": "{sent_m:.1f}",
+        f"sent beyond {MAX_ERROR_SIGMAS:.0f} sigma": "{sent_wrong}",
+        "largest error sent, m": "{sent_m:.1f}",
     }
     memory_mb, connections = result["memory_mb"], result["connections"]
     early = "no" if result["ended_early"] is None else f"with exit code {result['ended_early']}"
-    return f"""# A camera that misbehaves
+    return f"""# A flight with a faulty camera
 
 {base.strip_title(__doc__)}
 
 {base.format_table(result["rows"], columns)}
 
-{result["seconds"] / 60:.0f} minutes, {connections} connections of the camera. Ended early: {early}. Memory, MB:
-{memory_mb[0]:.0f} after the first fault, at most {max(memory_mb):.0f}, in the end {memory_mb[-1]:.0f}. After SIGTERM it
-ended in {result["end_s"]:.1f} s.
+{result["seconds"] / 60:.0f} minutes, {connections} connections to the camera. Ended early: {early}. Memory:
+{memory_mb[0]:.0f} MB after the first fault, at most {max(memory_mb):.0f} MB, {memory_mb[-1]:.0f} MB at the end. The
+process ended {result["end_s"]:.1f} s after SIGTERM.
 
 {base.format_origin(result, "python benchmarks/camera_faults.py")}
 """

@@ -1,12 +1,12 @@
-"""How sure a match is, leave-one-site-out on every set: `python confidence.py`, part of `make results`.
+"""Judge the confidence of matches, leaving one site out, on every set: `python benchmarks/confidence.py`.
 
-The evidence of every query in the map of every set is gathered first (see `confidence_rows`; an hour on two cores,
-kept in --work). Then, for each set, the shipped model is fitted anew to all other sites, adapted to the map of the set
-as `map build` does, and judged by the set's own queries and by those of all other sites. Whatever is reported of a site
-has been fitted without it. Which evidence counts, and how far a map moves the weights, was chosen with all sets in
-view.
+The script first gathers the evidence of every query in the map of every set (see `confidence_rows`; an hour on two
+cores, kept in --work). For each set, it then fits the shipped model anew to all other sites, adapts it to the map of
+the set as `map build` does, and judges it by the set's own queries and by those of all other sites. So no site is
+judged by a model that was fitted to its queries. The kinds of evidence, and how far a map may change the weights, were
+chosen on all sets.
 
-Writes confidence.json and confidence.md into benchmarks/results/; --ship writes the models that edgevpr has.
+Writes confidence.json and confidence.md into benchmarks/results/; --ship writes the models that edgevpr ships.
 """
 
 import argparse
@@ -37,11 +37,11 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter
 
 PRECISIONS = (0.9, 0.99, 0.999)
 EVIDENCE_KINDS = {"forward": (AHEAD, AHEAD_PROVEN), "nadir": (DOWN, DOWN_BARE)}
-ROUTE_SETS = ("corridor", "grief_stromovka_seasons", "nordland_tiny")  # as the map was made
-_MAX_QUERIES = 250  # queries
+ROUTE_SETS = ("corridor", "grief_stromovka_seasons", "nordland_tiny")  # whose queries follow the route of the map
+_MAX_QUERIES = 250  # of a replayed set
 _BINS = 10
 Rows = dict[str, list[Row]]
-Models = dict[str, Model]  # by the kind of evidence
+Models = dict[str, Model]  # by kind of evidence
 _COLUMNS = {
     "set": "{set}",
     "use": "{use}",
@@ -59,8 +59,8 @@ _COLUMNS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--work", type=Path, default=Path("confidence_rows"), help="folder of the gathered evidence")
-    parser.add_argument("--ship", type=Path, metavar="DIR", help="write the models of all sites there")
+    parser.add_argument("--work", type=Path, default=Path("confidence_rows"), help="folder for the gathered evidence")
+    parser.add_argument("--ship", type=Path, metavar="DIR", help="write models fitted to all sites into this folder")
     args = parser.parse_args()
     names = [folder.name for folder in base.find_sets()]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -76,18 +76,18 @@ def main() -> None:
 
 
 def write_models(folder: Path, rows: Rows) -> None:
-    """Write the models of all sites."""
+    """Write one model for each kind of evidence, fitted to all sites."""
     for camera, kinds in EVIDENCE_KINDS.items():
         names = [name for name in rows if infer_camera(name) == camera]
         count = sum(row.kind in ("own", "foreign") for name in names for row in rows[name])
         for kind in kinds:
-            made_of = f"{count} matches in the maps of {len(names)} sets"
-            model = fit_shipped_model(kind, [make_site(rows[name], kind) for name in names], made_of)
+            origin = f"{count} matches in the maps of {len(names)} sets"
+            model = fit_shipped_model(kind, [make_site(rows[name]) for name in names], origin)
             (folder / f"confidence_{kind}.json").write_text(json.dumps(asdict(model)) + "\n")
 
 
 def _read_rows(path: Path) -> list[Row]:
-    """Read gathered rows. A best place that was not worth a look at its landmarks has none that agree."""
+    """Read gathered rows. In nadir rows, landmarks that were not compared count as none that agree."""
     rows = pickle.loads(path.read_bytes())
     if infer_camera(path.stem) == "nadir":
         for number, row in enumerate(rows):
@@ -96,8 +96,9 @@ def _read_rows(path: Path) -> list[Row]:
     return rows
 
 
-def make_site(rows: Sequence[Row], kind: str, without: str | None = None) -> SiteEvidence:
-    """Return what a map says of its site, without the queries of `without`. A place beside a right one is right."""
+def make_site(rows: Sequence[Row], without: str | None = None) -> SiteEvidence:
+    """Return the evidence of one map, without the foreign queries of the site `without`. Neighbours of a right place
+    count as right."""
     return SiteEvidence(
         name=rows[0].map,
         own=[(row.evidence, row.right or row.near) for row in rows if row.kind == "own"],
@@ -111,29 +112,29 @@ def make_site(rows: Sequence[Row], kind: str, without: str | None = None) -> Sit
 
 
 def fit_held_out_models(name: str, rows: Rows) -> Models:
-    """Return the models of the map of one set, from the other sites and from what the map says of itself."""
+    """Fit the models of the map of one set to all other sites, and adapt them to the map."""
     camera, own_site = infer_camera(name), find_site(name)
     others = [other for other in rows if infer_camera(other) == camera and find_site(other) != own_site]
     is_adapted = len({row.query for row in rows[name] if row.kind == THERE}) >= MIN_PLACES
     models = {}
+    sites = [make_site(rows[other], own_site) for other in others]
     for kind in EVIDENCE_KINDS[camera]:
-        sites = [make_site(rows[other], kind, own_site) for other in others]
         model = fit_shipped_model(kind, sites, "other sites")
-        models[kind] = adapt_model(model, kind, make_site(rows[name], kind).answers, name) if is_adapted else model
+        models[kind] = adapt_model(model, kind, make_site(rows[name]).answers, name) if is_adapted else model
     return models
 
 
 def judge_queries(rows: Sequence[Row], models: Models) -> base.Row:
-    """Judge the queries of one map, its own and those of other sites."""
+    """Return the figures of one map, for its own queries and for those of other sites."""
     own, foreign = ([row for row in rows if row.kind == kind] for kind in ("own", "foreign"))
     rule = ConfidenceRule(models, PRECISIONS[-1])
     confidence = np.array([max(map(rule.confidence, _list_evidence(row))) for row in own])
     right = np.array([row.right for row in own])
     bins = np.minimum((_BINS * confidence).astype(int), _BINS - 1)
-    apart = np.bincount(bins, confidence - right) / len(own)  # of each bin, by its share of the queries
+    gaps = np.bincount(bins, confidence - right) / len(own)  # of each bin, weighted by its share of the queries
     result = {"set": rows[0].map, "use": base.find_use(rows[0].map), "queries": len(own), "right": int(right.sum())}
     result |= {"foreign": len(foreign), "roc_auc_score": roc_auc(np.array([row.score for row in own]), right)}
-    result |= {"roc_auc": roc_auc(confidence, right), "ece": float(abs(apart).sum()), "precision": {}}
+    result |= {"roc_auc": roc_auc(confidence, right), "ece": float(abs(gaps).sum()), "precision": {}}
     for precision in PRECISIONS:
         accepted = [row for row in own if _is_accepted(models, row, precision)]
         result["precision"][str(precision)] = {
@@ -152,82 +153,83 @@ def _is_accepted(models: Models, row: Row, precision: float) -> bool:
 
 
 def _list_evidence(row: Row) -> tuple[Evidence, Evidence]:
-    """Return the evidence of a row before landmarks are compared, ahead, and all of it: both can make a match sure."""
+    """Return the evidence of a row without and with proof by landmarks: either can be enough to accept a match."""
     return replace(row.evidence, proof=0.0), row.evidence
 
 
 def replay_routes(name: str, models: dict[str, Models]) -> base.Row:
-    """Fly along the way of a map in several manners, each query by itself and followed, and count fixes."""
+    """Replay the queries of a set in several orders, alone and with the place filter, and count accepted matches."""
     dataset = walks.load_matched_set(DATA / name)
     truth = {query.path.name: query for query in dataset.queries}
-    own = [path for path in list_images(DATA / name / "query") if path.name in truth][:_MAX_QUERIES]
-    other = "grief_michigan_monthly" if name != "nordland_tiny" else "corridor"
-    foreign = list_images(DATA / other / "query")[:30]
-    middle, third = len(own) // 2, len(own) // 3
-    manners = {
-        "as mapped": own,
-        "twice as fast": own[::2],
-        "half as fast": [path for path in own for _ in range(2)],
-        "back": own[::-1],
-        "hover": own[:third] + [own[third]] * 20 + own[third:],
-        "jump": own[:third] + own[2 * third :] + own[third : 2 * third],
-        "leave": own[:middle] + foreign + own[middle:],
+    own_paths = [path for path in list_images(DATA / name / "query") if path.name in truth][:_MAX_QUERIES]
+    other_set = "grief_michigan_monthly" if name != "nordland_tiny" else "corridor"
+    foreign_paths = list_images(DATA / other_set / "query")[:30]
+    middle, third = len(own_paths) // 2, len(own_paths) // 3
+    orders = {
+        "as mapped": own_paths,
+        "twice as fast": own_paths[::2],
+        "half as fast": [path for path in own_paths for _ in range(2)],
+        "back": own_paths[::-1],
+        "hover": own_paths[:third] + [own_paths[third]] * 20 + own_paths[third:],
+        "jump": own_paths[:third] + own_paths[2 * third :] + own_paths[third : 2 * third],
+        "leave": own_paths[:middle] + foreign_paths + own_paths[middle:],
     }
     result: base.Row = {"set": name, "ways": {}}
     with walks.make_map(DATA / name) as (place_map, index, technique):
         rule = make_accept_rule(technique, walks.make_config().match)
         rule = replace(rule, confidence_rule=ConfidenceRule(models[name], walks.make_config().match.accept_precision))
-        for manner, paths in manners.items():
+        for order, paths in orders.items():
             counts = {}
             for mode in ("alone", "followed"):
                 place_filter = PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if mode == "followed" else None
                 walk = walks.make_walk(place_map, index, technique, rule=rule, place_filter=place_filter)
                 counts[mode] = {"queries": 0, "right": 0, "beside": 0, "wrong": 0, "foreign": 0}
                 for path in paths:
-                    event, query = walk.step(walks.make_frame(path)), truth.get(path.name) if path in own else None
+                    event = walk.step(walks.make_frame(path))
+                    query = truth.get(path.name) if path in own_paths else None
                     counts[mode]["queries"] += query is not None
                     if event.accepted:
                         kind = classify_match(event.best.place.source_image, query, dataset.references, index)
                         counts[mode][kind] += 1
-            result["ways"][manner] = counts
+            result["ways"][order] = counts
     return result
 
 
 def format_page(result: base.Row) -> str:
-    """Return the page for people."""
+    """Return the results as Markdown."""
     for row in result["sets"]:
         for number, precision in enumerate(PRECISIONS):
             counts = row["precision"][str(precision)]
             row[f"at{number}"] = {**counts, "share": counts["accepted_right"] / max(1, row["right"])}
-    default, manners = str(PRECISIONS[-1]), list(result["flights"][0]["ways"])
+    default, orders = str(PRECISIONS[-1]), list(result["flights"][0]["ways"])
     accepted = sum(row["precision"][default]["foreign"] for row in result["sets"])
-    asked = sum(row["foreign"] for row in result["sets"])
+    foreign = sum(row["foreign"] for row in result["sets"])
     flights = [
-        {"set": flight["set"], "mode": mode, **{key: _format_counts(flight["ways"][key][mode]) for key in manners}}
+        {"set": flight["set"], "mode": mode, **{key: _format_counts(flight["ways"][key][mode]) for key in orders}}
         for flight in result["flights"]
         for mode in ("alone", "followed")
     ]
     table = base.format_table([{**row, "precision": None} for row in result["sets"]], _COLUMNS)
-    return f"""# How sure a match is
+    return f"""# Confidence of matches
 
 {base.strip_title(__doc__, "Writes confidence.json")}
 
-Right: share of the queries whose best place is right that are accepted. Wrong: accepted, and elsewhere. Beside:
-accepted, and at most two places beside a right one, which the set does not count as right. Foreign: accepted queries of
-other sites.
+Right: accepted share of the queries whose best place is right. Wrong: accepted queries whose best place is elsewhere.
+Beside: accepted queries whose best place is at most two places from a right one, which the set does not count as right.
+Foreign: accepted queries of other sites.
 
 {table}
 
-At {default}, {accepted} of {asked} foreign queries are accepted, over all pairings
-of sets and both cameras.
+At {default}, {accepted} of {foreign} foreign queries are accepted, over all pairs of sets
+and both cameras.
 
-## Followed from query to query
+## With the place filter
 
-Flights along the way of the map, at the default precision, each query by itself and followed; nothing is known of time
-or speed. Of nordland_tiny the first {_MAX_QUERIES} queries fly. Share of the queries accepted as the right place; in
-brackets wrong, beside, foreign.
+Flights along the route of the map at the default precision, with each query matched alone, and with the place filter
+(*followed*), which knows neither time nor speed. Of nordland_tiny, only the first {_MAX_QUERIES} queries are used. The
+share of the queries accepted at the right place; in brackets: wrong, beside, foreign.
 
-{base.format_table(flights, {name: f"{{{name}}}" for name in ("set", "mode", *manners)})}
+{base.format_table(flights, {name: f"{{{name}}}" for name in ("set", "mode", *orders)})}
 
 {base.format_origin(result, "python benchmarks/confidence.py")}
 """

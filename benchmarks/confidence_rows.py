@@ -1,4 +1,4 @@
-"""Evidence of every query of every set in the map of every set: what `confidence.py` fits and judges."""
+"""Gather the evidence of every query in the map of every set, from which `confidence.py` fits and judges models."""
 
 import pickle
 import tempfile
@@ -24,14 +24,14 @@ from edgevpr.runtime.recognise.judge import make_accept_rule
 
 # Sets of the same ground are one site.
 SITES = {"grief_stromovka_monthly": "stromovka", "grief_stromovka_seasons": "stromovka"}
-FOREIGN_ONLY_SETS = {"train_ie_tower": (12, "images")}  # no truth: every twelfth picture, as a foreign query only
-FOREIGN_QUERY_STEPS = {"nordland_tiny": 5}  # of 994 foreign queries every fifth
+FOREIGN_ONLY_SETS = {"train_ie_tower": (12, "images")}  # no ground truth: every twelfth picture is a foreign query
+FOREIGN_QUERY_STEPS = {"nordland_tiny": 5}  # every fifth of its 994 queries is a foreign query
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A query in a map. `kind` is own, foreign, or the way in which a changed picture of the map itself was asked for
-    (see `calibrate`). `near`: wrong, and the neighbour of a right place. `veto`: why no confidence would be enough."""
+    """The evidence of a query in a map. `kind`: "own", "foreign", or how `calibrate` made the query from a picture of
+    the map. `near`: the best place is wrong, but next to a right one. `veto`: why it is refused at any confidence."""
 
     map: str
     set: str
@@ -49,37 +49,38 @@ def find_site(name: str) -> str:
 
 
 def list_query_images(name: str, is_own: bool) -> list[Path]:
+    """Return the pictures of a set to use as its own queries, or as foreign ones."""
     step, folder = FOREIGN_ONLY_SETS.get(name, (1, "query"))
     return list_images(DATA / name / folder)[:: step if is_own else step * FOREIGN_QUERY_STEPS.get(name, 1)]
 
 
 def yield_rows(name: str, folder: Path) -> Iterator[Row]:
-    """Ask the map of the set `name`, which lies in `folder`."""
+    """Match the queries of all sets in the map of the set `name`, which is in `folder`, and changed pictures of it."""
     dataset = walks.load_matched_set(folder)
     scored = {query.path.name: query for query in dataset.queries}
     with walks.make_map(folder, images=folder / "ref") as (place_map, index, technique):
         rule = make_accept_rule(technique, walks.make_config().match)
-        rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))  # only objections refuse
+        rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))  # so that only vetoes refuse
         walk = walks.make_walk(place_map, index, technique, rule=rule, all_evidence=True)
-        for other in [set_folder.name for set_folder in base.find_sets()] + list(FOREIGN_ONLY_SETS):
-            if other != name and find_site(other) == find_site(name):
+        for query_set in [set_folder.name for set_folder in base.find_sets()] + list(FOREIGN_ONLY_SETS):
+            if query_set != name and find_site(query_set) == find_site(name):
                 continue
-            for path in list_query_images(other, other == name):
-                if other == name and path.name not in scored:
+            for path in list_query_images(query_set, query_set == name):
+                if query_set == name and path.name not in scored:
                     continue
                 event = walk.step(walks.make_frame(path))
                 if event.evidence is None:
                     continue
-                image, query = event.best.place.source_image, scored.get(path.name) if other == name else None
+                image, query = event.best.place.source_image, scored.get(path.name) if query_set == name else None
                 kind = classify_match(image, query, dataset.references, index)
                 if kind == "ignored":
                     continue
                 refused = not event.accepted and event.confidence >= rule.confidence_rule.threshold(event.evidence)
                 yield Row(
                     map=name,
-                    set=other,
+                    set=query_set,
                     query=path.name,
-                    kind="own" if other == name else "foreign",
+                    kind="own" if query_set == name else "foreign",
                     right=kind == "right",
                     near=kind == "beside",
                     score=event.best.match.score,
@@ -100,8 +101,8 @@ def yield_rows(name: str, folder: Path) -> Iterator[Row]:
 
 
 def classify_match(image: str, query: ScoredQuery | None, references: Sequence[str], index: PlaceIndex) -> str:
-    """Return what a best place is to a query (None: one of another site): right, ignored, beside a right one, wrong, or
-    foreign."""
+    """Return how the best place, given by its image, fits a query (None: of another site): "right", "ignored",
+    "beside" a right place, "wrong" or "foreign"."""
     if query is None:
         return "foreign"
     if image in query.correct:
@@ -113,13 +114,13 @@ def classify_match(image: str, query: ScoredQuery | None, references: Sequence[s
 
 
 def gather_rows(work: Path, name: str) -> None:
-    """Write the rows of the map of a set, unless they are there already."""
+    """Write the evidence rows of the map of a set, unless their file exists."""
     path = work / f"{name}.pkl"
     if not path.exists():
         work.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory() as placed:
+        with tempfile.TemporaryDirectory() as temporary:
             has_sites = (DATA / name / "sites.csv").exists()
-            folder = run_sets.place_sites(DATA / name, Path(placed)) if has_sites else DATA / name
+            folder = run_sets.place_sites(DATA / name, Path(temporary)) if has_sites else DATA / name
             rows = list(yield_rows(name, folder))
         path.with_suffix(".new").write_bytes(pickle.dumps(rows))
         path.with_suffix(".new").replace(path)

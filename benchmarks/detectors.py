@@ -1,5 +1,5 @@
-"""The card of an object detector. Its file is no part of edgevpr: it is looked for in $EDGEVPR_DETECTORS, by default
-../shared/models beside the project."""
+"""The object detector for the staticity criterion, and its card. Its file is not part of edgevpr: it must be in the
+folder $EDGEVPR_DETECTORS (default: ../shared/models beside the project)."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from edgevpr.techniques.session import hash_model_file
 NAME = "yolox_nano"
 FOLDER = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
 FILE = FOLDER / NAME / "model.onnx"
-# Of the eighty classes of COCO those that move (thesis 3.2.2), with their numbers.
+# The COCO classes that move (thesis 3.2.2), with their numbers.
 _DYNAMIC = {
     "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
     "bird": 14, "cat": 15, "dog": 16, "horse": 17, "sheep": 18, "cow": 19, "elephant": 20, "bear": 21, "zebra": 22,
@@ -24,8 +24,8 @@ _CARD = {
 }
 
 
-def write_card(folder: Path) -> None:
-    """Put the detector and its card into a folder of models."""
+def install_detector(folder: Path) -> None:
+    """Link the detector into a folder of models, and write its card there."""
     (folder / f"{NAME}.onnx").symlink_to(FILE.resolve())
     card = {
         "title": NAME,

@@ -1,6 +1,4 @@
-"""Put the figures of benchmarks/results/ into docs/figures.md, between its two markers: no figure there is typed by
-hand.
-"""
+"""Write the figures of benchmarks/results/ between the two markers of docs/figures.md: none is typed by hand."""
 
 from pathlib import Path
 from typing import Any
@@ -19,36 +17,36 @@ def main() -> None:
 
 
 def replace_figures(page: Path, figures: str) -> None:
-    """Put figures between the markers of a page."""
+    """Replace the text between the markers of a page by `figures`."""
     before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN_MARKER)
     _, _, after = rest.partition(END_MARKER)
     page.write_text(f"{before}{BEGIN_MARKER}\n{figures}\n\n{END_MARKER}{after}", encoding="utf-8")
 
 
 def format_recall(contents: list[dict[str, Any]]) -> str:
-    """Recall@1 of every technique on every set, then that of the forms, and what the rule of the flight let through."""
+    """Return recall@1 of every technique and of every reduced form on every set, and the matches accepted in flight."""
     weights = {row["weights"] for content in contents for row in content["techniques"].values() if row["weights"]}
-    by_flight = []
+    accepted_lines = []
     for content in contents:
         name = "cohog" if "cohog" in content["techniques"] else "hog"
         line = "* {set}: `{name}`, {accepted} of {queries}, {accepted_wrong} wrong"
         if content["techniques"][name]["queries_off_map"]:
             line += "; {accepted_off_map} of the {queries_off_map} off the map"
-        by_flight.append(line.format(set=content["set"], name=name, **content["techniques"][name]))
+        accepted_lines.append(line.format(set=content["set"], name=name, **content["techniques"][name]))
     return (
-        "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries whose place is in the map after "
-        "the use of a set):\n\n"
+        "Recall@1, made by `make results`. In brackets: the use of a set, and its number of queries whose place is in "
+        "the map:\n\n"
         f"{sets_page.format_recall_table(contents, lambda label: not label.endswith(sets_page.FORM_SUFFIXES))}\n\n"
-        "The same vectors less the map's mean, a byte or a bit a number:\n\n"
+        "The same vectors minus the mean of the map, with one byte or one bit per number:\n\n"
         f"{sets_page.format_recall_table(contents, lambda label: label.endswith(sets_page.FORM_SUFFIXES))}\n\n"
         f"Weights in use: {'; '.join(sorted(weights))}.\n\n"
         f"![Precision-recall curves of all techniques on all sets](../benchmarks/results/{sets_page.CURVES})\n\n"
-        "Accepted as the place by the rule of the flight:\n\n" + "\n".join(by_flight)
+        "Matches accepted by the rule of the flight:\n\n" + "\n".join(accepted_lines)
     )
 
 
 def format_speed() -> str:
-    """The figures of `make bench` that a builder asks for."""
+    """Return the figures of `make bench` for builders of aircraft."""
     content = base.read("bench")
     machine = content["machine"]
     rows = [[f"encode a frame ({row['entropy']})", f"{row['ours_ms']:.1f} ms", "-"] for row in content["encode"]]
@@ -62,7 +60,7 @@ def format_speed() -> str:
     rows += [[row["what"], f"{row['value']:.3g} {row['unit']}", "10 000 places"] for row in content["flight"]]
     return (
         f"Speed and memory on one thread of an {machine['cpu']}, made by `make bench`:\n\n"
-        f"{format_markdown_table(('what', 'measured', 'beside'), rows)}"
+        f"{format_markdown_table(('what', 'measured', 'comparison'), rows)}"
     )
 
 
