@@ -1,8 +1,8 @@
-"""Hold this project against the tables and figures of the thesis: `make thesis`.
+"""Compare this project with the tables and figures of the thesis: `make thesis`.
 
-Measures what no other benchmark does (the similarity matrices that the thesis's author published) into
-benchmarks/results/thesis.json, draws the curves beside it, and writes docs/thesis.md from that and the results of the
-other benchmarks. The values of the thesis stand in thesis.yaml, each with its source.
+Computes the figures of the similarity matrices that the thesis's author published, which no other benchmark does, to
+benchmarks/results/thesis.json, draws the curves, and writes docs/thesis.md from this file and the results of the other
+benchmarks. The values of the thesis are in thesis.yaml, each with its source.
 """
 
 import argparse
@@ -22,7 +22,7 @@ SET_NAME = "corridor"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--page", action="store_true", help="measure nothing: page and curves of what is there")
+    parser.add_argument("--page", action="store_true", help="only write page and curves, from existing results")
     if not parser.parse_args().page:
         matrices = measure_matrices(DATA / "vprbench_precomputed", DATA / SET_NAME)
         base.write_json("thesis", {**base.describe_run(), "matrices": matrices})
@@ -32,8 +32,8 @@ def main() -> None:
 
 
 def measure_matrices(folder: Path, images: Path) -> dict[str, dict]:
-    """Measure every stored similarity matrix of the author (a row per query, a column per reference), and add the
-    times that he published with them."""
+    """Return the figures of each similarity matrix of the author (a row per query, a column per reference), with the
+    times in seconds that he published with it, by technique."""
     times = {row["technique"]: row for row in base.read_csv(folder / f"{SET_NAME}_figures.csv")}
     references, truth = list_names(images / "ref"), read_truth(images / "ground_truth.csv")
     correct = np.array([[name in answers[0] for name in references] for answers in truth.values()])
@@ -50,7 +50,7 @@ def measure_matrices(folder: Path, images: Path) -> dict[str, dict]:
 
 
 def draw_curves(results: Results, path: Path) -> None:
-    """Draw the PR curves of the author's matrices of corridor, and those of the techniques here."""
+    """Draw the precision-recall curves on corridor: of the author's matrices, and of the techniques of this project."""
     theirs = {name: results.thesis["matrices"][matrix] for name, matrix in MATRICES.items()}
     ours = select_rows(results, "corridor")
     colours = {name: f"C{number}" for number, name in enumerate(ours)}

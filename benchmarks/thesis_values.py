@@ -1,4 +1,4 @@
-"""The values of the thesis, from thesis.yaml, this project's results, and what follows from the thesis's own inputs."""
+"""Values of the thesis (thesis.yaml), results of this project, and values computed from the thesis's own inputs."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -16,7 +16,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import queries_ah, stage_energy_j
 
 THESIS = yaml.safe_load(Path(__file__).with_suffix(".yaml").with_stem("thesis").read_text(encoding="utf-8"))
-# The thesis's names, by those of the rows of the results. Its CALC is the one with the authors' weights.
+# Label of the row of the results, by the thesis's name of the technique. Its CALC has the authors' weights.
 ROWS = {
     "HOG": "hog",
     "AlexNet": "alexnet",
@@ -29,7 +29,7 @@ ROWS = {
     "R-MAC": "rmac",
     "CoHOG": "cohog, thesis",
 }
-# The names of the matrices that the author published.
+# Name of the author's published matrix, by the thesis's name of the technique.
 MATRICES = {
     "HOG": "HOG",
     "AlexNet": "AlexNet_VPR",
@@ -45,7 +45,7 @@ XEON_BOARD = "thesis-xeon"
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The results that the page is made of: image sets by name, those of `make bench`, of the gate, and of
+    """The results that the page needs: of image sets (by name), of `make bench`, of the salience gate, and of
     `make thesis`."""
 
     sets: dict[str, dict[str, Any]]
@@ -55,14 +55,14 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Read the results of a folder."""
+    """Read these results from a folder."""
     sets = {content["set"]: content for content in sets_page.read_sets(folder)}
     return Results(sets, *(base.read(name, folder) for name in ("bench", "salience", "thesis")))
 
 
 def bound_formula(formula: Callable[..., float], printed: Iterable[str]) -> tuple[float, float, float]:
-    """Return what a formula makes of printed numbers, and the least and the most it can make of the numbers that they
-    were rounded from; the formula is monotonic in each."""
+    """Return the value of a formula for `printed` numbers, and its least and greatest value for numbers that round to
+    them. The formula must be monotonic in each number."""
     texts = list(printed)
     ends = [(float(text) - half_digit(text), float(text) + half_digit(text)) for text in texts]
     values = [formula(*corner) for corner in itertools.product(*ends)]
@@ -78,7 +78,7 @@ def format_3g(value: float | None, factor: float = 1.0) -> str:
 
 
 def capitalise(text: str) -> str:
-    """Begin a text with a capital."""
+    """Return a text with its first letter as a capital."""
     return text[:1].upper() + text[1:]
 
 
@@ -88,7 +88,7 @@ def half_digit(text: str) -> float:
 
 
 def total_ah(u_encode: float, u_match: float, t_encode_s: float, t_match_s: float) -> float:
-    """Compute Ah_t (5.7) by the power model of this project on the thesis's server, for N queries."""
+    """Return Ah_t (5.7) of N queries on the thesis's server, by the power model of this project."""
     table, board = THESIS["table_5_2"], load_board(XEON_BOARD)
     energy_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
     energy_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
@@ -104,7 +104,7 @@ def compute_table_pcu(technique: str) -> list[float | None]:
 
 
 def compute_pcu(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """Return the PCU of rows with `precision_at_100_recall` and `t_encode_s`, against the slowest of them."""
+    """Return the PCU of each row (`precision_at_100_recall`, `t_encode_s`), relative to the slowest of them."""
     slowest_s = max(row["t_encode_s"] for row in rows.values())
     return {
         name: metrics.pcu(row["precision_at_100_recall"], row["t_encode_s"], slowest_s) for name, row in rows.items()
@@ -112,7 +112,7 @@ def compute_pcu(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def select_rows(results: Results, name: str) -> dict[str, dict[str, Any]]:
-    """Return the rows of a set by the thesis's names of the techniques, and `cohog` as it flies."""
+    """Return the rows of a set, by the thesis's names of the techniques, with `cohog` as it flies."""
     techniques = results.sets[name]["techniques"]
     rows = {thesis_name: techniques[label] for thesis_name, label in ROWS.items() if label in techniques}
     return {**rows, "cohog, as it flies": techniques["cohog"]}

@@ -1,4 +1,4 @@
-"""Walks over maps of image sets, as a flight, an evaluation or a calibration has them, for the benchmarks."""
+"""Maps of image sets and recognisers that match in them, for the benchmarks."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -32,13 +32,13 @@ from edgevpr.techniques import create
 
 
 def load_matched_set(folder: Path) -> Dataset:
-    """Read a set; of its queries those whose place is in the map: how foreign ones fare has benchmarks of its own."""
+    """Read a set with only those queries whose place is in the map; other benchmarks measure foreign queries."""
     dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
     return replace(dataset, queries=tuple(query for query in dataset.queries if query.correct))
 
 
 def make_config(**keys: object) -> Config:
-    """Return the configuration with these keys, `map` for example, and otherwise as nobody has changed it."""
+    """Return the default configuration with these keys set, for example `map`."""
     return load_config(None, keys)
 
 
@@ -47,12 +47,12 @@ def make_meter() -> QueryMeter:
 
 
 def read_folder_frames(folder: Path) -> Iterator[Frame]:
-    """Yield the pictures of a folder, with their positions."""
+    """Yield the pictures of a folder as frames, with their positions."""
     return read_frames(open_source(str(folder), live=False))
 
 
 def make_frame(image: np.ndarray | Path, name: str | None = None, t_s: float = 0.0) -> Frame:
-    """Make a frame of a picture, or of the picture in a file."""
+    """Return a frame of a picture, given as an array or as a file."""
     if isinstance(image, Path):
         return Frame(image=read_image(image), name=name or image.name, t_mono_s=t_s)
     return Frame(image=image, name=name or "", t_mono_s=t_s)
@@ -66,8 +66,8 @@ def make_cohog(camera: str) -> Technique:
 def make_map(
     folder: Path, technique: Technique | None = None, images: Path | None = None
 ) -> Iterator[tuple[PlaceMap, PlaceIndex, Technique]]:
-    """Map the references of a set, by `cohog` unless another technique is named. The map is refined and calibrated as
-    `map build` does where `images` names their folder, from which pictures are read again."""
+    """Map the references of a set with `technique` (None: `cohog`) and yield map, index and technique. If `images`
+    names the folder of these pictures, the map is refined and calibrated as by `map build`."""
     technique = technique or make_cohog(base.infer_camera(folder.name))
     with open_temporary_map(read_folder_frames(folder / "ref"), technique, images) as (place_map, index, _):
         yield place_map, index, technique
@@ -85,8 +85,8 @@ def make_walk(
     levelling: Levelling | None = None,
     **more: Any,
 ) -> Recogniser:
-    """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
-    given; `more` is anything else of a `Recogniser`."""
+    """Return a recogniser for a map, with the technique's number of candidates and `rule` (None: the rule of the map).
+    `more` are other arguments of `Recogniser`."""
     rule = rule or make_accept_rule(technique, make_config().match, 1, read_calibration_for(place_map))
     settings = MatchSettings(candidates=technique.candidates, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m)
     encoder = FrameEncoder(technique=technique, levelling=levelling)
@@ -94,22 +94,22 @@ def make_walk(
 
 
 def list_ranked_names(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
-    """Return the names of the places that a query found, best first, by the names of the slots. Raises EdgevprError
-    where it failed."""
+    """Return the names of the places in the ranking of a query, best first; `names` are those of the slots. Raises
+    EdgevprError if the query failed."""
     if event.failed:
         raise base.EdgevprError(str(event.reason))
     return [names[slot] for slot in event.ranking.slots] if event.ranking else []
 
 
 def read_names(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
-    """Return the names of the pictures of the places, by slot."""
+    """Return the name of each place's picture, in the order of the slots of the index."""
     names = {place.place_id: place.source_image for place in place_map.read_places()}
     return [names[place_id] for place_id in index.place_ids.tolist()]
 
 
 @contextmanager
 def open_walk(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
-    """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
+    """Map images with the technique `name`, and yield a recogniser for that map that accepts no match."""
     technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
     with open_temporary_map(map(make_frame, places), technique) as (place_map, index, _):
         yield make_walk(place_map, index, technique, rule=AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0))

@@ -1,13 +1,13 @@
-"""Where exactly: how far fixes are from the truth, before and after the map is refined (part of `make results`).
+"""Where exactly: errors of fixes, before and after the map is refined (part of `make results`).
 
-The sets from the air with positions, each mapped and matched by the commands that a user has. Truths:
+Each aerial set with positions is mapped and matched by the commands of a user. There are three kinds of truth:
 
-* *pairs*: every registered pair of pictures (pairs_overlap.csv: local features and homographies, made with the sets)
-  and all GPS tags in one pose graph, in metres. A fix is compared with it as it lies to the four nearest pictures of
-  the map, so that what both have from the same tags does not count.
-* *GPS*: the tag of the query, which is itself some metres off.
-* *true*: of generated flights, whose cameras are where they say, with 5 m of noise on the positions of the map (in one
-  axis). Only this truth is that of the aircraft, and not of the middle of its picture.
+* *pairs*: one pose graph of all registered pairs of pictures (pairs_overlap.csv, from local features and homographies,
+  made with the sets) and all GPS tags, in metres. A fix is compared with it relative to the four nearest pictures of
+  the map, so that errors of the GPS tags that both share do not count.
+* *GPS*: the tag of the query, which has an error of some metres itself.
+* *true*: the exact position in generated flights, with 5 m of noise (per axis) on the positions of the map. Only this
+  truth is the position of the aircraft; the others are of the centre of the picture.
 
 Writes where.json, where.md and the picture where_maps.png into benchmarks/results/.
 """
@@ -29,12 +29,12 @@ from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
 from edgevpr.places.mapfile import PlaceMap
 
 SETS = ("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "aerial_brighton")
-_PAIR_SD = (0.01, 0.05)  # of a registered pair: of the step, as a share of the longest side, and of the log
+_PAIR_SD = (0.01, 0.05)  # of a registered pair: shift, as a share of the longest side; log of scale and rotation
 _NEAREST_PICTURES = 4
 NADIR_FLAGS = ("--technique", "cohog", "--camera", "nadir")
 REFINE_FLAGS = {"before": ("--no-refine",), "after": ()}
 SEEDS = (11, 12, 13)
-NOISE_SD_M = 5.0  # of the positions of the map, in one axis
+NOISE_SD_M = 5.0  # of the positions of the map, per axis
 _COLUMNS = {
     "set": "{set}",
     "use": "{use}",
@@ -49,8 +49,8 @@ _COLUMNS = {
 
 @dataclass(frozen=True, slots=True)
 class AerialSet:
-    """A set in metres, complex (east + i north) from its first tag: `tags` and, of those in its registered pairs,
-    `truth` by name."""
+    """The pictures of a set in metres, complex (east + i north) from the first tag (`origin`), by name: the GPS `tags`,
+    and the `truth` of the largest component of registered pairs."""
 
     name: str
     folder: Path
@@ -59,28 +59,29 @@ class AerialSet:
     truth: dict[str, complex]
 
     def to_metres(self, position: Position) -> complex:
-        """Return a position in metres."""
+        """Return a position as east + i north, in metres from the origin."""
         return complex(*offset_m(*self.origin, position.lat_deg, position.lon_deg))
 
 
 def load_set(folder: Path) -> AerialSet:
-    """Read a set, and solve its truth."""
+    """Read a set and solve the pose graph of its registered pairs."""
     positions = {name: tag.position for name, tag in read_positions(folder / "positions.csv").items() if tag.position}
     first = next(iter(positions.values()))
-    empty = AerialSet(folder.name, folder, (first.lat_deg, first.lon_deg), {}, {})
-    tags = {name: empty.to_metres(position) for name, position in positions.items()}
+    untagged = AerialSet(folder.name, folder, (first.lat_deg, first.lon_deg), {}, {})
+    tags = {name: untagged.to_metres(position) for name, position in positions.items()}
     names = sorted(tags)
     solved = _solve_pairs(folder, names, tags)
     largest = np.bincount(solved.component).argmax()
     truth = {names[slot]: complex(solved.position[slot]) for slot in np.flatnonzero(solved.component == largest)}
-    return AerialSet(folder.name, folder, empty.origin, tags, truth)
+    return AerialSet(folder.name, folder, untagged.origin, tags, truth)
 
 
 def _solve_pairs(folder: Path, names: list[str], tags: dict[str, complex]) -> GraphSolution:
     slots = {name: slot for slot, name in enumerate(names)}
     rejected_path = folder / "rejected_pairs.csv"
-    refused = base.read_csv(rejected_path) if rejected_path.is_file() else []
-    rejected, pairs = {(row["file_a"], row["file_b"]) for row in refused}, base.read_csv(folder / "pairs_overlap.csv")
+    rejected_rows = base.read_csv(rejected_path) if rejected_path.is_file() else []
+    rejected = {(row["file_a"], row["file_b"]) for row in rejected_rows}
+    pairs = base.read_csv(folder / "pairs_overlap.csv")
     rows = [row for row in pairs if (row["file_a"], row["file_b"]) not in rejected]
     longest = {name: max(read_set_image(folder, name).shape[:2]) for name in names}
     step = [complex(float(row["dx_px"]), -float(row["dy_px"])) / longest[row["file_b"]] for row in rows]
@@ -92,17 +93,17 @@ def _solve_pairs(folder: Path, names: list[str], tags: dict[str, complex]) -> Gr
 
 
 def read_set_image(folder: Path, name: str) -> np.ndarray:
-    """Read a picture of a set, of the map or a query."""
+    """Read a picture of a set, from ref/ or query/."""
     return read_image(next(folder / part / name for part in ("ref", "query") if (folder / part / name).is_file()))
 
 
 def measure_set(folder: Path, work: Path) -> tuple[Row, dict[str, Place], AerialSet]:
-    """Map and match a set, as it is and refined."""
+    """Map and match a set with and without refining; return its row, the refined places by picture, and the set."""
     site, matches = load_set(folder), {}
-    for how, flags in REFINE_FLAGS.items():
-        path = work / f"{folder.name}_{how}.gpkg"
+    for stage, flags in REFINE_FLAGS.items():
+        path = work / f"{folder.name}_{stage}.gpkg"
         built = base.run_edgevpr("map", "build", path, "--images", folder / "ref", *NADIR_FLAGS, *flags)
-        matches[how] = base.run_edgevpr("match", path, "--images", folder / "query")
+        matches[stage] = base.run_edgevpr("match", path, "--images", folder / "query")
     with PlaceMap.open(path) as place_map:
         places = {place.source_image: place for place in place_map.read_places()}
     errors, variances = _compute_errors(site, matches, places)
@@ -111,25 +112,25 @@ def measure_set(folder: Path, work: Path) -> tuple[Row, dict[str, Place], Aerial
         "set": folder.name,
         "use": base.find_use(folder.name),
         "spacing_m": float(np.median(abs(np.diff([site.tags[name] for name in places])))),
-        "errors": {truth: {how: summarise(own) for how, own in by_how.items()} for truth, by_how in errors.items()},
+        "errors": {truth: {key: summarise(off) for key, off in stages.items()} for truth, stages in errors.items()},
         "within": {
-            truth: compute_sigma_shares(errors[truth]["after"], own_variances, tag_var if truth == "GPS" else 0.0)
-            for truth, own_variances in variances.items()
+            truth: compute_sigma_shares(errors[truth]["after"], truth_variances, tag_var if truth == "GPS" else 0.0)
+            for truth, truth_variances in variances.items()
         },
     }
     return row, places, site
 
 
 def _compute_errors(site: AerialSet, matches: dict[str, list[Row]], places: dict[str, Place]) -> tuple[dict, dict]:
-    """Return the errors of fixes by their truth, before and after refining, and the variances of those after it, east
-    and north."""
+    """Return the errors of fixes (complex, metres) by kind of truth and by stage of the map (before or after refining),
+    and the variances (east, north) of the fixes after refining, by kind of truth."""
     places_m = {name: site.to_metres(place.position) for name, place in places.items()}
     refined = [name for name, place in places.items() if place.pose and name in site.truth]
     errors: dict[str, dict[str, list[complex]]] = {}
     variances: dict[str, list[tuple[float, float]]] = {}
-    for how, match in ((how, match) for how, how_matches in matches.items() for match in how_matches):
+    for stage, match in ((stage, match) for stage, stage_matches in matches.items() for match in stage_matches):
         name, fix = match["query"], match["position"]
-        if fix is None or (how == "after" and places[match["place"]["image"]].pose is None):
+        if fix is None or (stage == "after" and places[match["place"]["image"]].pose is None):
             continue
         truths = {"GPS": site.tags.get(name)}
         near = sorted(refined, key=lambda ref: abs(site.truth[ref] - site.truth.get(name, 0)))
@@ -138,40 +139,41 @@ def _compute_errors(site: AerialSet, matches: dict[str, list[Row]], places: dict
                 [places_m[ref] - site.truth[ref] for ref in near[:_NEAREST_PICTURES]]
             )
         for truth, true_m in truths.items():
-            here_m = site.to_metres(Position(fix["lat_deg"], fix["lon_deg"]))
-            errors.setdefault(truth, {}).setdefault(how, []).append(here_m - true_m)
-            if how == "after":
+            fix_m = site.to_metres(Position(fix["lat_deg"], fix["lon_deg"]))
+            errors.setdefault(truth, {}).setdefault(stage, []).append(fix_m - true_m)
+            if stage == "after":
                 var_east_m2, _, var_north_m2 = fix["covariance_m2"]
                 variances.setdefault(truth, []).append((var_east_m2, var_north_m2))
     return errors, variances
 
 
-def measure_generated_flights(work: Path, what: str, lens: tuple[str, ...]) -> Row:
-    """Map and match generated flights of several seeds, with noise on the positions of the map; with a `lens`, attitude
-    and height are used."""
-    errors: dict[str, list[complex]] = {how: [] for how in REFINE_FLAGS}
+def measure_generated_flights(work: Path, title: str, lens: tuple[str, ...]) -> Row:
+    """Map and match generated flights of several seeds, with noise on the positions of the map. `lens` are the options
+    of the field of view (empty: unknown); with them attitude and height are used, too."""
+    errors: dict[str, list[complex]] = {stage: [] for stage in REFINE_FLAGS}
     variances = []
     for seed in SEEDS:
         folder = work / f"seed{seed}{len(lens)}"
-        for which in ("map", "query"):
-            write_generated_flight(folder / which, which, seed)
+        for flight in ("map", "query"):
+            write_generated_flight(folder / flight, flight, seed)
         _add_noise(folder / "map" / "positions.csv", seed)
         true = {name: tag.position for name, tag in read_positions(folder / "query" / "positions.csv").items()}
-        for how, flags in REFINE_FLAGS.items():
-            path, (images, queries) = folder / f"{how}.gpkg", (folder / which / "images" for which in ("map", "query"))
+        for stage, flags in REFINE_FLAGS.items():
+            path = folder / f"{stage}.gpkg"
+            images, queries = folder / "map" / "images", folder / "query" / "images"
             base.run_edgevpr("map", "build", path, "--images", images, *NADIR_FLAGS, *lens, *flags)
             for match in base.run_edgevpr("match", path, "--images", queries, *lens):
                 if match["accepted"]:
                     truth, fix = true[match["query"]], match["position"]
-                    off_m = offset_m(truth.lat_deg, truth.lon_deg, fix["lat_deg"], fix["lon_deg"])
-                    errors[how].append(complex(*off_m))
-                    if how == "after":
+                    error_m = offset_m(truth.lat_deg, truth.lon_deg, fix["lat_deg"], fix["lon_deg"])
+                    errors[stage].append(complex(*error_m))
+                    if stage == "after":
                         variances.append((fix["covariance_m2"][0], fix["covariance_m2"][2]))
     return {
-        "set": f"{len(SEEDS)} generated flights, {what}",
+        "set": f"{len(SEEDS)} generated flights, {title}",
         "use": "report",
         "spacing_m": 21.0,
-        "errors": {"true": {how: summarise(values) for how, values in errors.items()}},
+        "errors": {"true": {stage: summarise(values) for stage, values in errors.items()}},
         "within": {"true": compute_sigma_shares(errors["after"], variances, 0.0)},
     }
 
@@ -185,7 +187,7 @@ def _add_noise(path: Path, seed: int) -> None:
 
 
 def summarise(errors: list[complex]) -> dict:
-    """Return count, median and 95th percentile of errors."""
+    """Return count, median and 95th percentile of errors (complex, metres)."""
     errors_m = np.abs(errors)
     return {
         "count": len(errors_m),
@@ -195,10 +197,10 @@ def summarise(errors: list[complex]) -> dict:
 
 
 def compute_sigma_shares(errors: list[complex], variances: list[tuple[float, float]], more_m2: float) -> dict:
-    """Return which shares of errors, axis by axis, are within one and two standard deviations; `more_m2` is the
-    variance of the truth."""
-    off = np.array([(error.real, error.imag) for error in errors])
-    ratio = abs(off) / np.sqrt(np.array(variances) + more_m2)
+    """Return the shares of errors, axis by axis, within one and two standard deviations of the fix. `variances` are
+    (east, north) of each fix; `more_m2`, the variance of the truth, is added."""
+    errors_m = np.array([(error.real, error.imag) for error in errors])
+    ratio = abs(errors_m) / np.sqrt(np.array(variances) + more_m2)
     return {"one_sigma": round(float((ratio < 1).mean()), 3), "two_sigma": round(float((ratio < 2).mean()), 3)}
 
 
@@ -218,17 +220,17 @@ def main() -> None:
 def format_page(result: Row) -> str:
     """Return the results as Markdown."""
     rows = [
-        {**row, "truth": truth, **by_how, "within": row["within"].get(truth)}
+        {**row, "truth": truth, **stages, "within": row["within"].get(truth)}
         for row in result["sets"]
-        for truth, by_how in sorted(row["errors"].items())
+        for truth, stages in sorted(row["errors"].items())
     ]
     return f"""# Where exactly
 
 {base.strip_title(__doc__, "Writes where.json")}
 
-Errors are median / 95th percentile of accepted matches: before refining, of the place's own position; after it, of the
-fix. Within: shares of errors, axis by axis, within one and two standard deviations of the fix (asked 0.68, 0.95);
-against GPS with the scatter of the tags, which refining has estimated, added.
+Errors are median / 95th percentile over accepted matches: before refining, of the position of the place; after it, of
+the fix. Within: shares of errors, axis by axis, within one and two standard deviations of the fix (ideal: 0.68, 0.95).
+For the truth GPS, these standard deviations include the scatter of the tags as estimated by refining.
 
 {base.format_table(rows, _COLUMNS)}
 
@@ -239,20 +241,20 @@ against GPS with the scatter of the tags, which refining has estimated, added.
 
 
 def draw_maps(maps: list[tuple[AerialSet, dict[str, Place]]], path: Path) -> None:
-    """Draw each map as it was recorded and refined, with the truth of its pairs."""
+    """Draw the positions of each map as recorded and as refined, with those of its registered pairs."""
     figure, axes = base.make_panels(14, 14, len(maps), 2)
     for axis, (site, places) in zip(axes, maps, strict=True):
         refined = [name for name, place in places.items() if place.pose]
         places_m = {name: site.to_metres(place.position) for name, place in places.items()}
-        both = [name for name in refined if name in site.truth]
-        offset = np.mean([places_m[name] - site.truth[name] for name in both])
+        registered = [name for name in refined if name in site.truth]
+        offset = np.mean([places_m[name] - site.truth[name] for name in registered])
         for name, place_m in places_m.items():
             tag_m = site.tags[name]
             axis.plot([tag_m.real, place_m.real], [tag_m.imag, place_m.imag], color="0.75", lw=0.8, zorder=1)
         for points, mark, colour, label in (
             ([site.tags[name] for name in places], "o", "#c05030", "as recorded"),
             ([places_m[name] for name in refined], "o", "#2060c0", "refined"),
-            ([site.truth[name] + offset for name in both], "+", "black", "registered pairs"),
+            ([site.truth[name] + offset for name in registered], "+", "black", "registered pairs"),
         ):
             axis.plot(np.real(points), np.imag(points), mark, color=colour, ms=5 if mark == "o" else 9, label=label)
         title = f"{site.name}: {len(refined)} of {len(places)} places refined"
