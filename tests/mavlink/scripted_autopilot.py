@@ -201,7 +201,7 @@ class Autopilot:
     def vehicle(self):
         return self.conversation.autopilot.vehicle
 
-    def at(self, t_s):
+    def predict(self, t_s):
         return self.conversation.predict_vehicle(t_s)
 
     def sd_m(self):

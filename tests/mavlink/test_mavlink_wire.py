@@ -46,6 +46,6 @@ def test_conversation_accepts_any_content_of_autopilot_messages():
             autopilot.conversation.handle(packet, autopilot.clock.now_s, None)
         autopilot.put_fix()
         autopilot.take_sent()
-        autopilot.at(autopilot.clock.now_s)
+        autopilot.predict(autopilot.clock.now_s)
     received = autopilot.conversation.reader.received
     assert received.total() - received["UNKNOWN"] > 10 * 300

@@ -40,10 +40,10 @@ def test_position_is_known_while_it_is_fresh(autopilot):
 def test_position_at_a_frame_time_is_extrapolated_with_the_velocity(autopilot):
     now_s = autopilot.position(vx=2000, vy=-1000).t_received_s
     for seconds in (-0.4, 0.25):
-        there = autopilot.at(now_s + seconds)
+        there = autopilot.predict(now_s + seconds)
         off_m = offset_m(50.0, 8.0, there.lat_deg, there.lon_deg)
         assert off_m == pytest.approx((-10 * seconds, 20 * seconds), abs=1e-6)
-    old = autopilot.at(now_s + 1.5)
+    old = autopilot.predict(now_s + 1.5)
     assert (old.lat_deg, old.lon_deg) == (50.0, 8.0), "nobody knows"
 
 
@@ -112,13 +112,13 @@ def test_attitude_is_that_of_the_frame_time(autopilot):
         autopilot.attitude(*attitude)
         autopilot.position()
         autopilot.wait(0.2)
-    seen = autopilot.at(start_s + 0.05)
+    seen = autopilot.predict(start_s + 0.05)
     assert (seen.roll_deg, seen.pitch_deg, seen.heading_deg) == pytest.approx((-5, 5, 355), abs=1e-4)
-    assert autopilot.at(start_s + 0.1).heading_deg % 360 == pytest.approx(0, abs=1e-4), "the short way over north"
-    last = autopilot.at(start_s + 0.65)
+    assert autopilot.predict(start_s + 0.1).heading_deg % 360 == pytest.approx(0, abs=1e-4), "the short way over north"
+    last = autopilot.predict(start_s + 0.65)
     assert (last.roll_deg, last.heading_deg) == pytest.approx((20, 20), abs=1e-4), "the last one holds for 0.3 s"
     for away_s in (-0.35, 0.75):
-        other = autopilot.at(start_s + away_s)
+        other = autopilot.predict(start_s + away_s)
         assert (other.roll_deg, other.pitch_deg, other.heading_deg) == (None, None, 90.5), "the report's own heading"
     assert autopilot.vehicle.roll_deg is None
 

@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 COUNT = 30
 
 
-def make_page_from(log, places=(), folder=None):
+def make_page(log, places=(), folder=None):
     album = make_album([folder] if folder else [])
     return make_flight_page(read_flight(log), list(places), album, album)
 
@@ -26,7 +26,7 @@ def page_path(tmp_path_factory):
     (folder / "ref").mkdir()
     places = write_places(folder / "ref")
     log = write_log(folder / "log", *make_flight_lines(places, COUNT))
-    (folder / "page.html").write_text(make_page_from(log, places, folder / "ref"), "utf-8", "backslashreplace")
+    (folder / "page.html").write_text(make_page(log, places, folder / "ref"), "utf-8", "backslashreplace")
     return folder / "page.html"
 
 
@@ -61,7 +61,7 @@ def test_damaged_log_still_has_its_steps(browser, tmp_path):
     """Figures that are none, and no position at all."""
     broken = query("a", confidence="high", evidence=[], position={"lat_deg": 1e99}, located=None, fix=7, vehicle="?")
     log = write_log(tmp_path / "log", ("query", broken), ("query", {"query": None, "place": 1e14}))
-    (tmp_path / "page.html").write_text(make_page_from(log), "utf-8")
+    (tmp_path / "page.html").write_text(make_page(log), "utf-8")
     with open_page(browser, tmp_path / "page.html") as page:
         assert page.inner_text("#which") == "1 of 2"
         assert page.locator(".view").count() == 0

@@ -101,12 +101,12 @@ def test_odometry_over_lower_ground_is_correct_once_matches_show_its_height():
 @px4_channels
 @pytest.mark.parametrize("map_off_m", [8, 20])
 def test_px4_uses_gps_again_after_a_test_without_gps(map_off_m, parameters):
-    def fly_without(flight):
+    def suspend_gps(flight):
         flight.map_off_m = map_off_m
         flight.set("EKF2_GPS_CTRL", 0).fly(20)
         flight.set("EKF2_GPS_CTRL", 7).fly(GPS_AGAIN_S + 5)  # it has to fly back
 
-    assert_no_worse("px4-copter", fly_without, watched_s=60.0, **parameters)
+    assert_no_worse("px4-copter", suspend_gps, watched_s=60.0, **parameters)
 
 
 @px4_channels

@@ -46,7 +46,7 @@ def fly(belief, places, rng, p=0.8):
     return [belief.update(make_place_evidence(place, rng, p), STEP, PLACES) for place in places]
 
 
-def is_at(posterior, place):
+def is_near(posterior, place):
     return abs(posterior.position[0] - place) <= 2
 
 
@@ -64,7 +64,7 @@ def test_update_gains_confidence_from_consistent_queries(speed):
     posteriors = fly(Belief(ORDER_SCALE), places, np.random.default_rng(2))
     assert max(each.mass for each in posteriors) >= CERTAIN
     assert all(each.mass > 0.99 for each in posteriors[12:])
-    assert all(is_at(each, place) for each, place in zip(posteriors, places, strict=True))
+    assert all(is_near(each, place) for each, place in zip(posteriors, places, strict=True))
     assert posteriors[0].mass < 0.85
 
 

@@ -92,7 +92,7 @@ class Flight:
         assert_sound(followed)
         return followed
 
-    def over(self, places, p=0.8, **more):
+    def query_places(self, places, p=0.8, **more):
         return [self.query(place, p, **more) for place in places]
 
 
@@ -190,7 +190,7 @@ def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(pos
 
 def test_place_filter_is_lost_beyond_the_map(posed_map):
     flight = Flight(posed_map, METRIC_INDEX)
-    flight.over(range(10, 40, STRIDE))
+    flight.query_places(range(10, 40, STRIDE))
     east_m, north_m = 0.8 * SPACING_M * STRIDE, -0.6 * SPACING_M * STRIDE  # across the row of places
     found = [flight.query(80, 0.01, moved_m=(east_m, north_m), velocity_m_s=(0.0, 0.0)) for _ in range(4)]
     assert found[0].lost < 0.6
@@ -211,7 +211,7 @@ def test_place_filter_tracks_a_recording_without_times(flight, t_utc_s):
 def test_place_filter_keeps_only_the_last_pass_of_a_frame(flight):
     other = Flight(flight.place_map, flight.index)
     for each in (flight, other):
-        each.over(range(10, 40, STRIDE))
+        each.query_places(range(10, 40, STRIDE))
         each.advance()
     flight.handle(90, 0.9)
     assert flight.handle(40, 0.9) == other.handle(40, 0.9)
