@@ -127,13 +127,8 @@ def _time_query(opened: tuple[Technique, PlaceMap, PlaceIndex], camera: str, pri
     picture = load_frames()[0]
 
     def match(candidates: int | None) -> None:
-        query = Query(
-            technique=technique,
-            descriptor=technique.encode(picture),
-            place_map=place_map,
-            index=index,
-            expected=expected,
-        )
+        descriptor = technique.encode(picture)
+        query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
         compare_places(query, scan_index(query), candidates, 0.0)
 
     match(technique.candidates)

@@ -1,9 +1,8 @@
 """Fly for an hour with a faulty camera: `python benchmarks/camera_faults.py [SECONDS]`.
 
 A simulated plane without GPS flies laps over generated ground. Its camera sends MPEG-TS with sound over TCP. It works
-well for 6 to 20 s, then has a fault for 6 to 20 s, and so on, in an order that follows from a fixed seed; real cameras
-showed all these faults. Each accepted match, and each position sent to the autopilot, is compared with the position of
-the plane at that time.
+well for 6 to 20 s, then has a fault for 6 to 20 s, and so on, by a fixed seed; real cameras have had all these faults.
+Each accepted match and each position sent to the autopilot is compared with the plane's position at that time.
 """
 
 import json

@@ -1,10 +1,9 @@
 """Judge the confidence of matches, leaving one site out, on every set: `python benchmarks/confidence.py`.
 
 The script first gathers the evidence of every query in the map of every set (see `confidence_rows`; an hour on two
-cores, kept in --work). For each set, it then fits the shipped model anew to all other sites, adapts it to the map of
-the set as `map build` does, and judges it by the set's own queries and by those of all other sites. So no site is
-judged by a model that was fitted to its queries. The kinds of evidence, and how far a map may change the weights, were
-chosen on all sets.
+cores, kept in --work). For each set, it then fits the shipped model anew to all other sites, without any query of the
+set's site, adapts it to the map of the set as `map build` does, and judges it by the queries of the set and of all
+other sites. The kinds of evidence, and how far a map may change the weights, were chosen on all sets.
 
 Writes confidence.json and confidence.md into benchmarks/results/; --ship writes the models that edgevpr ships.
 """

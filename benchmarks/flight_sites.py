@@ -1,7 +1,7 @@
-"""Ground for flights.py: mosaics of real aerial pictures, maps of the pictures ref/, and room to fly over query/.
+"""Sites for flights.py: a map of the pictures ref/ of a set, and the mosaic of its pictures query/ to fly over.
 
-Both mosaics of a set are laid in one frame, its mosaic_positions.csv, so that map and flight share a position on the
-Earth and no picture. Metres are east and north of the middle of a mosaic.
+Both mosaics of a set have the frame of its mosaic_positions.csv, so that map and flight share positions on the Earth
+and no picture. Metres are east and north of the middle of a mosaic.
 """
 
 import csv
@@ -20,19 +20,19 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.overflight import photograph_ground
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
-# Sets without positions, or too few of them: metres of a pixel and a place on the Earth are assumed.
+# Sets with too few positions: their pixel size and their position on the Earth are assumed.
 _ASSUMED_GROUNDS = {
     "kite_ochota": Ground("EPSG:32634", rasterio.Affine(0.3, 0, 498_000, 0, -0.3, 5_784_000)),
     "aerial_copr": Ground("EPSG:32630", rasterio.Affine(0.1, 0, 500_000, 0, -0.1, 6_400_000)),
 }
-_IMAGE_WIDTH_PX = 640  # every picture of the sets, on the canvas at scale 1
+_IMAGE_WIDTH_PX = 640  # of every picture of the sets, in a mosaic at scale 1
 _GRID_PX = 480
-# A picture under any heading is covered if a square of this share of its longest side has this share of ground.
+# A picture of any heading is covered if a square of this share of its longest side has this share of ground.
 _SQUARE_SIDE_SHARE = 0.95
 _MIN_GROUND_SHARE = 0.93
-_FOOTPRINT_FACTORS = np.linspace(0.5, 1.5, 11)  # sizes of a picture that are tried
-_MIN_FOOTPRINT_FACTOR = 0.8  # of the smallest picture with which a point can be flown over
-_MAX_ROOM_DISTANCE = 0.35  # footprints: farther from any ground to fly over, a place is not on the route
+_FOOTPRINT_FACTORS = np.linspace(0.5, 1.5, 11)  # sizes of a picture to try, of the site's footprint
+_MIN_FOOTPRINT_FACTOR = 0.8  # of the smallest picture that a flyable point must allow
+_MAX_FLYABLE_DISTANCE = 0.35  # footprints: a place farther from flyable ground is passed by (see `_find_route`)
 ROWS_SITE = "rows"
 _ROWS_SET = "aerial_copr"
 _ROWS_COPIES = 4
@@ -42,7 +42,7 @@ _ROWS_FOOTPRINT_M = 48.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """Values (G, G) of the ground around the origin of a site, north up, `metres_per_px` apart."""
+    """Values (G, G) on a grid around the origin of a site, north up, `metres_per_px` apart."""
 
     values: np.ndarray
     metres_per_px: float
@@ -54,23 +54,23 @@ class Grid:
         return self.values[row.clip(0, last), column.clip(0, last)]
 
     def list_points_m(self) -> np.ndarray:
-        """Return where the values are true, (N, 2) in metres."""
+        """Return the points, (N, 2) in metres, at which the values are true."""
         row, column = np.nonzero(self.values)
         half = len(self.values) / 2
         return np.column_stack([column + 0.5 - half, half - row - 0.5]) * self.metres_per_px
 
     def snap(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the nearest points where the values are true to points (N, 2)."""
-        free = self.list_points_m()
-        return np.array([free[np.argmin(((free - point_m) ** 2).sum(axis=1))] for point_m in points_m])
+        """Return for each of the points (N, 2) the nearest one at which the values are true."""
+        candidates_m = self.list_points_m()
+        return np.array([candidates_m[np.argmin(((candidates_m - point_m) ** 2).sum(axis=1))] for point_m in points_m])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """A map and the ground that is flown over, the mosaic `query_mosaic`. `origin` is (lat_deg, lon_deg). `route_m`
-    (N, 2) are the places in their order, as far as there is ground to fly over, and `footprints_m` (N,) the sizes of
-    their pictures on the ground. `widest_m`: the longest side of a picture that has ground there; `room`: where that
-    is wide enough to fly over; `covered`: the share of a picture there that the map shows."""
+    """A map, and the mosaic `query_mosaic` to fly over. `origin`: (lat_deg, lon_deg). `route_m` (N, 2): the places of
+    the mapped route, over flyable ground; `footprints_m` (N,): the longest sides of their pictures on the ground. Grids
+    by the centre of a picture: `max_footprint_m`: its largest footprint with ground in the mosaic; `flyable`: whether
+    that is large enough; `covered`: the share of a picture there that the map shows."""
 
     name: str
     place_map: Path
@@ -79,21 +79,21 @@ class Site:
     footprint_m: float
     route_m: np.ndarray
     footprints_m: np.ndarray
-    widest_m: Grid
-    room: Grid
+    max_footprint_m: Grid
+    flyable: Grid
     covered: Grid
 
     def to_position(self, point_m: np.ndarray) -> Position:
-        """Return the position of a point (2,)."""
+        """Return the position of a point (2,) in metres."""
         return Position(*offset_position(*self.origin, *point_m.tolist()))
 
     def to_offset_m(self, position: Position) -> np.ndarray:
-        """Return the metres (2,) of a position."""
+        """Return the point (2,), in metres, of a position."""
         return np.array(offset_m(*self.origin, position.lat_deg, position.lon_deg))
 
 
 def prepare_site(name: str, data: Path, work: Path) -> Site:
-    """Write the mosaics of a site, and build and refine its map by the command that a user has."""
+    """Write the mosaics of a site, and build its map by `edgevpr map build`, which also refines it."""
     folder = work / name
     folder.mkdir()
     if name == ROWS_SITE:
@@ -111,21 +111,21 @@ def prepare_site(name: str, data: Path, work: Path) -> Site:
 
 
 def _prepare_rows_site(set_folder: Path, folder: Path) -> Site:
-    """Make ground on which one piece repeats itself four times, beside its mirror image, which is alone; and map it by
-    a flight over what the pictures ref/ show."""
+    """Make ground that consists of the mirror image of one piece and of four copies of the piece, and map it by a
+    simulated flight over the pictures ref/."""
     layout = read_layout(set_folder)
     mosaics = {part: make_mosaic(set_folder, layout, part) for part in ("ref", "query")}
-    top, left, high, wide = _find_largest_box(mosaics["ref"][1] & mosaics["query"][1])
-    metre_px = _ROWS_WIDTH_M / wide
+    top, left, height, width = _find_largest_box(mosaics["ref"][1] & mosaics["query"][1])
+    metre_px = _ROWS_WIDTH_M / width
     ground = Ground("EPSG:32630", rasterio.Affine(metre_px, 0, 520_000, 0, -metre_px, 6_400_000))
     for part, (canvas, _) in mosaics.items():
-        piece = canvas[top : top + high, left : left + wide]
+        piece = canvas[top : top + height, left : left + width]
         canvas = np.hstack([piece[:, ::-1], *[piece] * _ROWS_COPIES])
         write_tif(folder / f"{part}.tif", ground, canvas, np.ones(canvas.shape[:2], bool))
     photo, rng = Orthophoto(folder / "ref.tif"), np.random.default_rng(5)
     (folder / "images").mkdir()
     positions, step_m = {}, _ROWS_FOOTPRINT_M / 4
-    half_m = np.array([_ROWS_WIDTH_M * (_ROWS_COPIES + 1), high * metre_px]) / 2 - _ROWS_FOOTPRINT_M / 2
+    half_m = np.array([_ROWS_WIDTH_M * (_ROWS_COPIES + 1), height * metre_px]) / 2 - _ROWS_FOOTPRINT_M / 2
     camera, light = Camera(), Light(sun_azimuth_deg=0, sun_elevation_deg=90)
     height_m = _ROWS_FOOTPRINT_M * camera.focal_px / camera.width
     lanes = np.linspace(-half_m[1], half_m[1], 1 + round(2 * half_m[1] / (1.5 * step_m)))
@@ -133,8 +133,8 @@ def _prepare_rows_site(set_folder: Path, folder: Path) -> Site:
         east_m = np.arange(-half_m[0], half_m[0], step_m)
         for east in east_m if lane % 2 == 0 else east_m[::-1]:
             position = move_position(photo.middle, float(east), float(north_m))
-            up_deg = 90.0 if lane % 2 == 0 else 270.0
-            pose = CameraPose(east_m=0, north_m=0, height_m=height_m, heading_deg=up_deg)
+            heading_deg = 90.0 if lane % 2 == 0 else 270.0
+            pose = CameraPose(east_m=0, north_m=0, height_m=height_m, heading_deg=heading_deg)
             image = photograph_ground(photo, position, pose, camera, light, rng)
             if image is not None:
                 file = f"{len(positions):04d}.jpg"
@@ -145,6 +145,7 @@ def _prepare_rows_site(set_folder: Path, folder: Path) -> Site:
 
 
 def _build_site(name: str, folder: Path, images: Path, positions: dict, footprints_m: np.ndarray) -> Site:
+    """Build the map of images at `positions`, and find the ground that can be flown over."""
     place_map, table = folder / "map.gpkg", folder / "positions.csv"
     with open(table, "w", newline="") as handle:
         rows = ((file, *position) for file, position in positions.items())
@@ -155,50 +156,49 @@ def _build_site(name: str, folder: Path, images: Path, positions: dict, footprin
     middle = photos["ref"].middle
     origin, footprint_m = (middle.lat_deg, middle.lon_deg), float(np.median(footprints_m))
     south, west, north, east = photos["ref"].extent_deg
-    wide_m = 2 * max(np.abs(offset_m(*origin, *corner)).max() for corner in ((south, west), (north, east)))
-    valid = {part: photo.cut(middle, wide_m, _GRID_PX)[1] for part, photo in photos.items()}
+    side_m = 2 * max(np.abs(offset_m(*origin, *corner)).max() for corner in ((south, west), (north, east)))
+    valid = {part: photo.cut(middle, side_m, _GRID_PX)[1] for part, photo in photos.items()}
     for photo in photos.values():
         photo.close()
-    metre_px = wide_m / _GRID_PX
-    widest_m = np.zeros((_GRID_PX, _GRID_PX))
-    for side_m in _FOOTPRINT_FACTORS * footprint_m:
-        widest_m[_measure_share(valid["query"], side_m / metre_px) >= _MIN_GROUND_SHARE] = side_m
-    room = Grid(values=widest_m >= _MIN_FOOTPRINT_FACTOR * footprint_m, metres_per_px=metre_px)
-    route, numbers = _find_route(
-        np.array([offset_m(*origin, *position) for position in positions.values()]), room, footprint_m
-    )
+    metre_px = side_m / _GRID_PX
+    max_footprint_m = np.zeros((_GRID_PX, _GRID_PX))
+    for picture_m in _FOOTPRINT_FACTORS * footprint_m:
+        max_footprint_m[_measure_share(valid["query"], picture_m / metre_px) >= _MIN_GROUND_SHARE] = picture_m
+    flyable = Grid(values=max_footprint_m >= _MIN_FOOTPRINT_FACTOR * footprint_m, metres_per_px=metre_px)
+    places_m = np.array([offset_m(*origin, *position) for position in positions.values()])
+    route_m, numbers = _find_route(places_m, flyable, footprint_m)
     return Site(
         name=name,
         place_map=place_map,
         query_mosaic=folder / "query.tif",
         origin=origin,
         footprint_m=footprint_m,
-        route_m=route,
+        route_m=route_m,
         footprints_m=footprints_m[numbers],
-        widest_m=Grid(values=widest_m, metres_per_px=metre_px),
-        room=room,
+        max_footprint_m=Grid(values=max_footprint_m, metres_per_px=metre_px),
+        flyable=flyable,
         covered=Grid(values=_measure_share(valid["ref"], footprint_m / metre_px), metres_per_px=metre_px),
     )
 
 
 def _measure_share(valid: np.ndarray, side_px: float) -> np.ndarray:
-    """Return the share of ground in the square of a picture of this side around each point."""
+    """Return the share of valid ground in the square of a picture of `side_px`, centred on each point."""
     side = max(1, round(_SQUARE_SIDE_SHARE * side_px))
     return cv2.blur(valid.astype(np.float32), (side, side), borderType=cv2.BORDER_CONSTANT)
 
 
-def _find_route(places_m: np.ndarray, room: Grid, footprint_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mapped way over ground that can be flown over, and the places on it (slices of them). A place without
-    such ground near it is passed on the straight line between those before and after."""
-    near = room.snap(places_m)
-    near_room = np.flatnonzero(np.hypot(*(near - places_m).T) < _MAX_ROOM_DISTANCE * footprint_m)
-    numbers = np.arange(near_room[0], near_room[-1] + 1)
-    line = np.column_stack([np.interp(numbers, near_room, near[near_room, axis]) for axis in (0, 1)])
-    return room.snap(line), numbers
+def _find_route(places_m: np.ndarray, flyable: Grid, footprint_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mapped route over flyable ground, (N, 2) in metres, and the consecutive numbers of its places. Places
+    without such ground near them are replaced by points on the straight line between their neighbours."""
+    nearest_m = flyable.snap(places_m)
+    near = np.flatnonzero(np.hypot(*(nearest_m - places_m).T) < _MAX_FLYABLE_DISTANCE * footprint_m)
+    numbers = np.arange(near[0], near[-1] + 1)
+    line_m = np.column_stack([np.interp(numbers, near, nearest_m[near, axis]) for axis in (0, 1)])
+    return flyable.snap(line_m), numbers
 
 
 def _find_largest_box(covered: np.ndarray, step: int = 20) -> tuple[int, int, int, int]:
-    """Return top, left, height and width of the largest box that is covered all over, in steps of some pixels."""
+    """Return top, left, height and width of the largest box that is covered all over, in steps of `step` pixels."""
     rows, columns = (np.arange(0, length + 1, step) for length in covered.shape)
     total = cv2.integral(covered.astype(np.uint8))[np.ix_(rows, columns)]
     best = (0, 0, 0, 0)

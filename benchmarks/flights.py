@@ -1,24 +1,22 @@
-"""Fifty flights over real aerial pictures, every way of recognising asked with the same pictures (`make results`).
+"""Fly fifty flights over real aerial pictures, and match the same pictures in every mode: part of `make results`.
 
-Map and flight share no picture. The map of a set is made of its pictures ref/, at their positions in the mosaic of the
-set, and refined. A flight is seen by a simulated camera over the mosaic of its pictures query/, in the same frame: in
-light of its own, swaying by 3 degrees, turned anyhow, from up to a fifth lower or higher than the map, and lower where
-there is too little ground. A picture of which a tenth has none is left out. Where a flight leaves the map, it goes on
-over the mosaic of another set.
+Map and flight share no picture. The map of a set is built from its pictures ref/, at their positions in the mosaic of
+the set, and refined. A simulated camera flies over the mosaic of query/, in the same frame: in varied light, swaying by
+3 degrees, at any heading, from up to a fifth lower or higher than the map, and lower where there is too little ground.
+A picture of which more than a tenth lacks ground is left out. Off the map, a flight is over the mosaic of another set.
 
-Flights follow the mapped way (at the pace of the map, half and twice as fast, backwards, turning back, with a hover,
-with stops, carried elsewhere twice, leaving the map and coming back), cross it, or are over another set altogether. On
-the site *rows* one piece of ground repeats itself four times. The autopilot tells of its odometry only: its scale is
-5 % off, its bias wanders by up to 0.5 m/s, the heading is 5 degrees off. From a third on, the odometry of some flights
-stops, is wrong by a factor of two, or is not a number; some have none.
+Flights follow the mapped route (at the speed of the map, half and twice as fast, backwards, turning back, with a hover,
+with stops, carried elsewhere twice, leaving the map and coming back), cross the site, or are over another set
+altogether. At the site *rows*, one piece of ground occurs four times. The autopilot reports odometry alone, with errors
+of 5 % in scale, of up to 0.5 m/s in velocity (a bias that varies) and of 5 degrees in heading. From a third of the
+flight on, the odometry of some flights stops, is wrong by a factor of two, or is not a number; some have none.
 
-A fix is *wrong* where the aircraft is over ground of another set, or farther off than both a quarter of the longest
-side of the map's pictures, on the ground, and three standard deviations that the fix claims. It is *far off* where it
-is more than half that side off, whatever it claims. Lost are the times over the map without a fix that is right.
+A fix is *wrong* where the aircraft is over ground of another set, or where its error exceeds both a quarter of the
+longest side of the map's pictures on the ground and three of its claimed standard deviations. It is *far off* where its
+error exceeds half that side, whatever it claims. *Lost* is the time over the map without a right fix.
 
-Positions of kite_ochota, aerial_copr and rows have an assumed scale. The truth is that of the mosaic, which drifts: of
-aerial_swindale its scale changes by a factor of two from one end to the other. aerial_brighton has four pictures to fly
-over: too few.
+Positions of kite_ochota, aerial_copr and rows have an assumed scale. The truth is that of the mosaic, which drifts: the
+scale of aerial_swindale changes by a factor of two from end to end. aerial_brighton has too few pictures to fly over.
 """
 
 import argparse
@@ -57,11 +55,11 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _SEED = 2026
-# A fix is wrong beyond both: sides of the map's pictures on the ground, and standard deviations that it claims.
+# A fix is wrong beyond both: in longest sides of the map's pictures on the ground, and in claimed standard deviations.
 _WRONG_ERROR_SIDES = 0.25
 _WRONG_ERROR_SIGMAS = 3.0
 _FAR_ERROR_SIDES = 0.5
-_MIN_MAPPED_SHARE = 0.5  # of a picture over the map is in pictures of the map
+_MIN_MAPPED_SHARE = 0.5  # of a picture, in pictures of the map: less is not over the map
 _COLUMNS = {
     "flights": "{name}",
     "mode": "{mode}",
@@ -83,6 +81,7 @@ SITES = {
 def _make_recogniser(
     technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, tracks_flight: bool = False
 ) -> Recogniser:
+    """Return a recogniser for sequences of `length`; with `tracks_flight`, with the place filter of a live flight."""
     config = walks.make_config()
     reach_m_s = config.match.reach_m_s
     return walks.make_walk(
@@ -97,7 +96,7 @@ def _make_recogniser(
     )
 
 
-# The ways of recognising, as a flight has them.
+# The modes of recognition that a flight can use.
 MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
     "filter": partial(_make_recogniser, tracks_flight=True),
     "alone": partial(_make_recogniser),
@@ -107,7 +106,7 @@ MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Which flight it is: `number` seeds it, `other` is the site it goes on over where it leaves the map."""
+    """A planned flight. `number` seeds it; `other` is the site whose ground is below it off the map."""
 
     number: int
     site: str
@@ -129,7 +128,7 @@ def plan_flights() -> list[Flight]:
 
 
 def run_flight(flight: Flight, sites: dict[str, Site]) -> list[Row]:
-    """Fly once, and ask every mode with each picture; return a row for each query and mode."""
+    """Fly once, and match each picture in every mode. Returns a row for each query and mode."""
     cv2.setNumThreads(1)
     site, rng = sites[flight.site], np.random.default_rng((_SEED, flight.number))
     track = flight_tracks.make_track(flight.kind, site, sites[flight.other], rng)
@@ -137,27 +136,21 @@ def run_flight(flight: Flight, sites: dict[str, Site]) -> list[Row]:
     photos = {name: Orthophoto(sites[name].query_mosaic) for name in {flight.site, flight.other}}
     opened = open_recogniser(walks.make_config(map=str(site.place_map)), load_board("this"))
     recognisers = {mode: make(opened.technique, opened.place_map, opened.index) for mode, make in MODES.items()}
-    share, fields = (
-        site.covered.sample(track.position_m),
-        {"flight": flight.number, "site": site.name, "kind": flight.kind},
-    )
+    mapped_share = site.covered.sample(track.position_m)
+    fields = {"flight": flight.number, "site": site.name, "kind": flight.kind, "odometry": flight.odometry}
     rows = []
     for number, image in enumerate(flight_tracks.take_photographs(track, photos, sites, rng)):
         if image is None:
             continue
-        t_s, (east_m, north_m), ground = (
-            float(track.t_s[number]),
-            track.position_m[number].tolist(),
-            track.site_names[number],
-        )
+        t_s, site_below = float(track.t_s[number]), track.site_names[number]
+        east_m, north_m = track.position_m[number].tolist()
         query: Row = {
             **fields,
-            "odometry": flight.odometry,
             "t_s": round(t_s, 2),
             "east_m": round(east_m, 2),
             "north_m": round(north_m, 2),
-            "over": ground,
-            "is_mapped": bool(ground == site.name and share[number] >= _MIN_MAPPED_SHARE),
+            "site_below": site_below,
+            "is_mapped": bool(site_below == site.name and mapped_share[number] >= _MIN_MAPPED_SHARE),
         }
         frame = walks.make_frame(image, f"{number:03d}", t_s)
         for mode, recogniser in recognisers.items():
@@ -168,18 +161,18 @@ def run_flight(flight: Flight, sites: dict[str, Site]) -> list[Row]:
 
 
 def _score_fix(event: Recognition, site: Site, query: Row) -> Row:
-    """Return what a query has led to: `fix` is "right", "wrong" or None, with its error by the truth of the query."""
+    """Return the figures of the fix of a query by its true position: `fix` is "right", "wrong" or None."""
     located = event.located
     if located is None:
         return {"fix": None}
-    off_m = site.to_offset_m(located.position) - (query["east_m"], query["north_m"])
-    error_m, side_m, sd_m = float(np.hypot(*off_m)), site.footprint_m, located.accuracy_m
-    foreign = query["over"] != site.name
-    is_wrong = foreign or error_m > max(_WRONG_ERROR_SIDES * side_m, _WRONG_ERROR_SIGMAS * sd_m)
+    offset_m = site.to_offset_m(located.position) - (query["east_m"], query["north_m"])
+    error_m, side_m, sd_m = float(np.hypot(*offset_m)), site.footprint_m, located.accuracy_m
+    is_foreign = query["site_below"] != site.name
+    is_wrong = is_foreign or error_m > max(_WRONG_ERROR_SIDES * side_m, _WRONG_ERROR_SIGMAS * sd_m)
     return {
         "fix": "wrong" if is_wrong else "right",
-        "is_far": bool(foreign or error_m > _FAR_ERROR_SIDES * side_m),
-        "off_m": complex(*off_m),
+        "is_far": bool(is_foreign or error_m > _FAR_ERROR_SIDES * side_m),
+        "off_m": complex(*offset_m),
         "sd_m": round(sd_m, 2),
         "variances_m2": (located.covariance_m2[0], located.covariance_m2[2]),
     }
@@ -187,10 +180,10 @@ def _score_fix(event: Recognition, site: Site, query: Row) -> Row:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sites", metavar="A,B", default=",".join(SITES), help="whose maps are flown with (all)")
+    parser.add_argument("--sites", metavar="A,B", default=",".join(SITES), help="maps to fly with (default: all)")
     args = parser.parse_args()
     base.find_sets(names=[name for name in SITES if name != ROWS_SITE])
-    began_s, rows = time.monotonic(), []
+    begin_s, rows = time.monotonic(), []
     flights = [flight for flight in plan_flights() if flight.site in args.sites.split(",")]
     with (
         tempfile.TemporaryDirectory(prefix="edgevpr-flights-") as work,
@@ -198,15 +191,15 @@ def main() -> None:
     ):
         prepare = partial(flight_sites.prepare_site, data=base.DATA, work=Path(work))
         sites = {site.name: site for site in pool.map(prepare, SITES)}
-        for flight, new in zip(flights, pool.map(partial(run_flight, sites=sites), flights), strict=True):
-            rows += new
+        for flight, flight_rows in zip(flights, pool.map(partial(run_flight, sites=sites), flights), strict=True):
+            rows += flight_rows
             print(flight, flush=True)
-    result = {**base.describe_run(), "took_s": round(time.monotonic() - began_s), **summarise_modes(rows, list(MODES))}
+    result = {**base.describe_run(), "took_s": round(time.monotonic() - begin_s), **summarise_modes(rows, list(MODES))}
     base.write("flights", result, format_page(result))
 
 
 def summarise_modes(rows: Sequence[Row], modes: Sequence[str]) -> dict:
-    """Return the figures of every mode, by what the flights have in common."""
+    """Return the figures of every mode: of all flights, and by use, site, kind of flight and odometry."""
     groups: dict[str, Callable[[Row], object]] = {
         "all": lambda row: "all",
         "use": lambda row: find_use(row["site"]),
@@ -219,17 +212,18 @@ def summarise_modes(rows: Sequence[Row], modes: Sequence[str]) -> dict:
         names = dict.fromkeys(key(row) for row in rows)
         result[group] = {name: {} for name in names}
         for name, mode in product(names, modes):
-            own = [row for row in rows if key(row) == name and row["mode"] == mode]
-            result[group][name][mode] = _compute_figures(own)
+            mode_rows = [row for row in rows if key(row) == name and row["mode"] == mode]
+            result[group][name][mode] = _compute_figures(mode_rows)
     return result
 
 
 def _compute_figures(rows: Sequence[Row]) -> dict:
+    """Return the figures of the queries of one mode. `within`: shares of errors within 1 and 2 claimed sigmas."""
     flights = {number: [row for row in rows if row["flight"] == number] for number in {row["flight"] for row in rows}}
     over_s, lost_s, gaps = zip(*map(_measure_lost_time, flights.values()), strict=True)
     fixes = [row for row in rows if row["fix"]]
     right = [row for row in fixes if row["fix"] == "right"]
-    own = [(row["off_m"], row["variances_m2"]) for row in fixes if row["over"] == row["site"]]
+    home_errors = [(row["off_m"], row["variances_m2"]) for row in fixes if row["site_below"] == row["site"]]
     gaps_s = [max(gaps_of_flight) for gaps_of_flight in gaps if gaps_of_flight]
     return {
         "flights": len(flights),
@@ -238,35 +232,35 @@ def _compute_figures(rows: Sequence[Row]) -> dict:
         "right": len(right),
         "wrong": len(fixes) - len(right),
         "far_off": sum(row["is_far"] for row in fixes),
-        "wrong_over_other_ground": sum(row["over"] != row["site"] for row in fixes),
+        "wrong_over_other_ground": sum(row["site_below"] != row["site"] for row in fixes),
         "over_the_map_s": round(sum(over_s)),
         "lost_s": round(sum(lost_s)),
         "longest_gap_s": {"median": round(np.median(gaps_s), 1), "worst": round(max(gaps_s), 1)} if gaps_s else None,
         "error": summarise([row["off_m"] for row in right]) if right else None,
         "claimed_sd_m": round(float(np.median([row["sd_m"] for row in right])), 2) if right else None,
-        "within": compute_sigma_shares(*zip(*own, strict=True), more_m2=0.0) if own else None,
+        "within": compute_sigma_shares(*zip(*home_errors, strict=True), more_m2=0.0) if home_errors else None,
     }
 
 
 def _measure_lost_time(rows: Sequence[Row]) -> tuple[float, float, list[float]]:
-    """Return, of one flight, the seconds over the map, those of queries without a fix that is right, and the times
-    between one such fix, or the begin, and the next, or the end. Each stretch over the map counts by itself."""
+    """Return the seconds of one flight over the map, those that ended without a right fix, and, at each query over the
+    map, the seconds since the last right fix. Each stretch over the map counts by itself, from its first query."""
     over_s = lost_s = 0.0
     gaps_s: list[float] = []
-    since_s = None
+    last_right_s = None
     for before, row in zip([None, *rows[:-1]], rows, strict=True):
         if not row["is_mapped"]:
-            since_s = None
+            last_right_s = None
             continue
-        if since_s is None:
-            since_s = row["t_s"]
+        if last_right_s is None:
+            last_right_s = row["t_s"]
         elif before is not None:
-            took_s = row["t_s"] - before["t_s"]
-            over_s += took_s
-            lost_s += took_s * (row["fix"] != "right")
-        gaps_s.append(row["t_s"] - since_s)
+            interval_s = row["t_s"] - before["t_s"]
+            over_s += interval_s
+            lost_s += interval_s * (row["fix"] != "right")
+        gaps_s.append(row["t_s"] - last_right_s)
         if row["fix"] == "right":
-            since_s = row["t_s"]
+            last_right_s = row["t_s"]
     return over_s, lost_s, gaps_s
 
 
@@ -281,19 +275,19 @@ def format_page(result: Row) -> str:
             for over_s in [figures["over_the_map_s"] or None]
         ]
         tables.append((f"By {group}:\n\n" if group != "all" else "") + base.format_table(rows, _COLUMNS))
+    tuning_sites = [name for name in base.TUNING_SETS if name in result["site"]]
     return f"""# Flights over real aerial pictures
 
 {base.strip_title(__doc__)}
 
-Right, wrong, far off: fixes. Lost: share of the time over the map. Gap: the longest without a right fix over the map,
-median and worst of the flights. Errors: median / 95th percentile of right fixes. Within: shares of errors, axis by
-axis, within one and two standard deviations that the fix claims (asked 0.68, 0.95), of all fixes over the site's own
-ground.
+Right, wrong and far off are numbers of fixes. Lost: share of the time over the map. Gap: longest time over the map
+without a right fix, median / worst of the flights. Error: median / 95th percentile of right fixes. Within: share of the
+errors, axis by axis, within one and two claimed standard deviations (should be 0.68 and 0.95), of all fixes over the
+site's own ground.
 
 {tables[0]}
 
-Constants of edgevpr were chosen on {" and ".join(name for name in base.TUNING_SETS if name in result["site"])} (use
-*tune*), of the sites here; on none of these flights.
+Constants of edgevpr were chosen on pictures of {" and ".join(tuning_sites)} (use *tune*), but on none of these flights.
 
 {(chr(10) * 2).join(tables[1:])}
 

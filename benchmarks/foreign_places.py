@@ -1,8 +1,8 @@
-"""Places that are nowhere near any query of the sites in `sites.py`: what a map of ten thousand places is filled with.
+"""Make places that no query of the sites in `sites.py` shows, to fill a map up to ten thousand places.
 
-Looking down: the pictures of the sites themselves, mirrored, and cut to a half or more of each side; and generated
-landscapes. A mirrored picture is ground that exists nowhere, of the same grass, roofs and light as the ground that is
-asked for. Looking ahead: pictures of other sets, whole, mirrored, and their left and right 70 %.
+Looking down: pictures of the sites themselves, mirrored and cropped to at least half of each side, then generated
+landscapes. A mirrored picture shows ground that exists nowhere, with the same grass, roofs and light as the queries.
+Looking ahead: pictures of other sets, whole, their left and their right 70 %, then all of these mirrored.
 """
 
 import zlib
@@ -18,21 +18,21 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, 
 from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M
 from edgevpr.lab.simulate.landscape import make_scene
 
-# The names of the places begin with one of these.
+# Prefixes of the names of places.
 MIRRORED_PREFIX = "mirrored"
 GENERATED_PREFIX = "generated"
 OTHER_SET_PREFIX = "other set"
-# Neither is the ground of a site that is asked for. grief_stromovka_monthly is: it is the park of the seasons.
+# None shows a site of a query. grief_stromovka_monthly would: it is the park of grief_stromovka_seasons.
 OTHER_SETS = ("nordland_tiny/ref", "nordland_tiny/query", "train_ie_tower/images", "grief_michigan_monthly/query")
-_CROPS_PER_IMAGE = 8  # of a picture
-_MARGIN_M = 65.0  # of a scene: nothing beyond its edge is seen
+_CROPS_PER_IMAGE = 8
+_MARGIN_M = 65.0  # of a scene, so that no picture shows what is beyond its edge
 _PLACES_EAST = 22  # of a scene
 _PLACES_NORTH = 12
-_FIRST_SEED = 1000
+_FIRST_SEED = 1000  # of the generated landscapes
 
 
 def yield_foreign_places(camera: str, count: int, data: Path, sites: list[Path]) -> Iterator[Frame]:
-    """Yield `count` places in the order of their mapping; fewer, where there are no more (looking ahead)."""
+    """Yield the frames of `count` places in the order of mapping, or of all that exist (looking ahead)."""
     frames = _yield_nadir_places(sites) if camera == "nadir" else _yield_forward_places(data)
     return islice(frames, count)
 
@@ -53,14 +53,14 @@ def _yield_nadir_places(sites: list[Path]) -> Iterator[Frame]:
 
 
 def _crop_image(image: np.ndarray, share: float, down: float, right: float) -> np.ndarray:
-    """Cut a picture to a share of its sides; `down` and `right` (0..1) say from where."""
-    high, wide = (round(share * side) for side in image.shape[:2])
-    top, left = round(down * (image.shape[0] - high)), round(right * (image.shape[1] - wide))
-    return image[top : top + high, left : left + wide]
+    """Crop a picture to a `share` of its sides. `down`, `right` (0..1): where the crop is."""
+    height, width = (round(share * side) for side in image.shape[:2])
+    top, left = round(down * (image.shape[0] - height)), round(right * (image.shape[1] - width))
+    return image[top : top + height, left : left + width]
 
 
 def _yield_landscape(seed: int) -> Iterator[Frame]:
-    """Yield the places of a generated landscape, under a light of its own, from heights of 50 to 80 m."""
+    """Yield the places of a generated landscape, in random light, from heights of 50 to 80 m."""
     rng = np.random.default_rng(seed)
     light = Light(
         sun_azimuth_deg=rng.uniform(0, 360),
@@ -86,8 +86,8 @@ def _yield_forward_places(data: Path) -> Iterator[Frame]:
             for folder in OTHER_SETS:
                 for path in list_images(data / folder):
                     image = read_image(path)
-                    wide = image.shape[1]
-                    image = image[:, round(start * wide) : round(end * wide)][:, :: -1 if is_mirrored else 1]
+                    width = image.shape[1]
+                    image = image[:, round(start * width) : round(end * width)][:, :: -1 if is_mirrored else 1]
                     change = f"{'mirrored ' if is_mirrored else ''}{cut}"
                     yield _make_frame(image, f"{OTHER_SET_PREFIX}/{change}/{folder}/{path.name}")
 

@@ -1,9 +1,7 @@
-"""Streams that break, pictures that say nothing, and maps that are damaged, all made from a seed: `make hostile` writes
+"""Try broken streams, pictures that show no place, and damaged maps, all made from a seed: `make hostile` writes
 benchmarks/results/hostile.md and hostile.json.
 
 python benchmarks/hostile.py [--parts A,B] [--seed N]
-
-The tables say what was tried, how often, and what came of it.
 """
 
 import argparse
@@ -15,30 +13,30 @@ import hostile_maps
 import hostile_pictures
 from base import Row
 
-# name: (title, how it is run, usual count: of pictures of each stream, pictures of each kind in each map, maps)
+# name: (title, function, count: pictures of each stream, pictures of each kind in each map, or maps)
 PARTS = {
     "streams": ("Streams: pictures that are cut, corrupted, lost or frozen", damaged_streams.run, 240),
-    "pictures": ("Pictures that say nothing, of other ground, and behind a display", hostile_pictures.run, 100),
+    "pictures": ("Pictures of nothing, of other ground, and behind a display", hostile_pictures.run, 100),
     "maps": ("Maps that are damaged", hostile_maps.run, 200),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", metavar="A,B", default=",".join(PARTS), help=f"some of {', '.join(PARTS)}")
+    parser.add_argument("--parts", metavar="A,B", default=",".join(PARTS), help="parts to try (default: all)")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     for name in args.parts.split(","):
         _, run, count = PARTS[name]
-        print(f"trying: {name}", flush=True)
+        print(f"trying {name}", flush=True)
         rows = [asdict(row) if is_dataclass(row) else row for row in run(count, args.seed)]
         result = base.read("hostile") | {name: {**base.describe_run(), "seed": args.seed, "rows": rows}}
         base.write("hostile", result, format_page(result))
 
 
 def format_page(result: Row) -> str:
-    """Return the page for people: a table for each part, with the fields of its rows as columns."""
-    parts = ["# Tried as a hostile world would\n\nMade by `make hostile`: all inputs come from a seed."]
+    """Return the results as Markdown: a table for each part, with the fields of its rows as columns."""
+    parts = ["# Hostile streams, pictures and maps\n\nMade by `make hostile`: all inputs come from a seed."]
     for name, (title, _, _) in PARTS.items():
         if part := result.get(name):
             origin = f"{part['date']}, commit {part['commit']}, seed {part['seed']}, {part['machine']['cpu']}."
@@ -49,7 +47,7 @@ def format_page(result: Row) -> str:
 
 
 def _format_value(value: object) -> str:
-    """Return a figure in three digits, and of counts by reason those that are not 0."""
+    """Format a float with three digits, and counts by reason without zeros."""
     if isinstance(value, float):
         return f"{value:.3g}"
     if isinstance(value, dict):

@@ -1,9 +1,8 @@
-"""Places built alike, looking ahead: `python look_alikes.py [--sets A,B]` prints what the map of each set accepts,
-calibrated as `map build` does.
+"""Count matches among places that look alike to a forward camera: `python benchmarks/look_alikes.py [--sets A,B]`.
 
-Every query is asked twice: in the map, and in the map without its place and what shows the same ground. What is
-accepted then is wrong. *unproven* are those of the right ones with which no more than 8 landmarks agree: what it would
-cost to ask for landmarks of every match.
+Each map is calibrated as by `map build`. Every query is matched twice: in the map, and in the map without its place and
+the places that show the same ground, where each accepted match is wrong (*left_out*). *unproven*: right matches with at
+most 8 agreeing landmarks, which would be lost if every match needed landmarks.
 """
 
 import argparse
@@ -18,12 +17,12 @@ from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.evidence import CHANCE_INLIERS, count_neighbours
 
 SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
-_NEIGHBOURS_LEFT_OUT = 8  # places along a way
+_NEIGHBOURS_LEFT_OUT = 8  # places along the route, on both sides
 _COLUMNS = {name: f"{{{name}}}" for name in ("set", "queries", "right", "unproven", "wrong", "left_out")}
 
 
 def measure_set(name: str) -> base.Row:
-    """Ask all queries of one set."""
+    """Match all queries of one set, and return the counts."""
     folder = DATA / name
     dataset = walks.load_matched_set(folder)
     row: base.Row = {"set": name, "queries": len(dataset.queries), "right": 0, "unproven": 0, "wrong": 0, "left_out": 0}
@@ -42,15 +41,15 @@ def measure_set(name: str) -> base.Row:
                 row["unproven"] += is_right and landmarks <= np.log1p(CHANCE_INLIERS)
             right_slots = [slot for slot in slots if dataset.references[slot] in {*query.correct, *query.ignored}]
             masks = [outside_neighbourhood(index, slot, slots, 0.0, max_slots=neighbours) for slot in right_slots]
-            rest = index.select(np.all(masks, axis=0))
-            without = walks.make_walk(place_map, rest, technique, rule=walk.rule)
+            remaining = index.select(np.all(masks, axis=0))
+            without = walks.make_walk(place_map, remaining, technique, rule=walk.rule)
             row["left_out"] += without.step(walks.make_frame(query.path)).accepted
     return row
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", default=",".join(SETS), help="names of sets, comma-separated")
+    parser.add_argument("--sets", default=",".join(SETS), help="sets to match, comma-separated")
     print(base.format_table([measure_set(name) for name in parser.parse_args().sets.split(",")], _COLUMNS))
 
 

@@ -1,9 +1,9 @@
-"""The loop of an autopilot that flies by edgevpr's positions while edgevpr takes its attitude: `python
-benchmarks/loop.py` flies simulated autopilots, whose filter tilts with the errors that it is fed, and writes
-benchmarks/results/loop.md.
+"""Test the closed loop of edgevpr, whose positions an autopilot flies by, and the autopilot, whose attitude edgevpr
+uses: `python benchmarks/loop.py` flies simulated autopilots and writes benchmarks/results/loop.md.
 
-Each flight lasts two minutes in closed loop, with one thing changed; three last half an hour by our stream alone. Then
-the factor of the accuracy that ArduPilot is told is swept: the smallest one that leaves every loop stable is right.
+The filter of a simulated autopilot tilts with the errors of its input. Each flight lasts two minutes, with one change;
+three last half an hour on our stream alone. Then the factor by which we inflate the accuracy for ArduPilot is swept:
+the smallest factor with which every loop is stable is right.
 """
 
 import itertools
@@ -21,23 +21,23 @@ ODOMETRY = {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}
 SET_UPS = {
     "GPS_INPUT": ("arducopter", {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}),
     "ODOMETRY (ArduPilot)": ("arducopter", ODOMETRY),
-    "message 296": ("px4-copter", {"EKF2_AGP0_CTRL": 1}),
+    "GLOBAL_POSITION_SENSOR": ("px4-copter", {"EKF2_AGP0_CTRL": 1}),
     "ODOMETRY (PX4)": ("px4-copter", {"EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 1}),
 }
 CHANGES = {
     "nothing": {},
     **{f"answers {late_s:g} s late": {"late_s": late_s} for late_s in (0.1, 0.25, 0.5, 1.0, 2.0)},
     **{f"times {time_s:+g} s wrong": {"time_error_s": time_s} for time_s in (-0.3, -0.1, 0.1, 0.3)},
-    **{f"strides {scale:g} times as long": {"stride_scale": scale} for scale in (0.7, 0.9, 1.1, 1.4)},
+    **{f"odometry scale {scale:g}": {"stride_scale": scale} for scale in (0.7, 0.9, 1.1, 1.4)},
     **{f"camera tilted by {tilt_deg:g} degrees": {"mount_tilt_deg": tilt_deg} for tilt_deg in (-5.0, -2.0, 2.0, 5.0)},
 }
 FACTORS = (1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0)
-FACTOR_CHANGES = ("nothing", "answers 1 s late", "times +0.3 s wrong", "strides 0.7 times as long")
-MAV_CMD_SET_EKF_SOURCE_SET = 42007  # MAV_CMD_SET_EKF_SOURCE_SET
+FACTOR_CHANGES = ("nothing", "answers 1 s late", "times +0.3 s wrong", "odometry scale 0.7")
+MAV_CMD_SET_EKF_SOURCE_SET = 42007
 
 
 def fly_without_gps(name: str, changes: dict[str, float]) -> dict[str, float]:
-    """Fly by our stream alone, GPS lost, a match each second; return the largest distances, metres."""
+    """Fly by our stream alone after GPS is lost, with a match each second. Returns the largest distances, metres."""
     vehicle, parameters = SET_UPS[name]
     flight = ClosedLoop(vehicle, **parameters).fly(SETTLE_DURATION_S)
     for field, value in changes.items():
@@ -48,7 +48,7 @@ def fly_without_gps(name: str, changes: dict[str, float]) -> dict[str, float]:
 
 
 def fly_with_gps(match_every: int | None) -> dict[str, float]:
-    """Fly half an hour by our ODOMETRY alone while GPS is good, a match every `match_every` frames (None: none)."""
+    """Fly half an hour by our ODOMETRY alone beside good GPS, with a match every `match_every` frames (None: never)."""
     flight = ClosedLoop("arducopter", matches=match_every is not None, **ODOMETRY).fly(SETTLE_DURATION_S)
     flight.match_every = match_every or 1
     flight.command(MAV_CMD_SET_EKF_SOURCE_SET, 2)
@@ -56,20 +56,20 @@ def fly_with_gps(match_every: int | None) -> dict[str, float]:
 
 
 def fly_with_factor(name: str, factor: float) -> list[float]:
-    """Fly with this factor of the claimed accuracy; return the largest distance by each change of SWEPT, metres."""
+    """Fly with this factor of the claimed accuracy. Returns the largest distance by FACTOR_CHANGES, metres."""
     shipped, navigator.CORRELATION_FACTOR = navigator.CORRELATION_FACTOR, factor
-    flights = [fly_without_gps(name, CHANGES[changed]) for changed in FACTOR_CHANGES]
+    flights = [fly_without_gps(name, CHANGES[change]) for change in FACTOR_CHANGES]
     navigator.CORRELATION_FACTOR = shipped
     return [max(row["away_m"], row["away_later_m"]) for row in flights]
 
 
 def fly_and_measure(flight: ClosedLoop, seconds: float) -> dict[str, float]:
-    """Fly on, and return the largest distances in each half of it: of the aircraft from its target, and of the
-    autopilot's estimate from the truth."""
+    """Fly for `seconds`, and return the largest distances, metres: of the aircraft from its target in each half of that
+    time, and of the autopilot's estimate from the truth."""
     begin_s = flight.now_s
     flight.fly(seconds)
-    half = round((begin_s + seconds / 2) / closed_loop.STEP_S)
     first = round(begin_s / closed_loop.STEP_S)
+    half = round((begin_s + seconds / 2) / closed_loop.STEP_S)
     return {
         "away_m": round(max(flight.away_m[first:half]), 1),
         "away_later_m": round(max(flight.away_m[half:]), 1),
@@ -78,7 +78,7 @@ def fly_and_measure(flight: ClosedLoop, seconds: float) -> dict[str, float]:
 
 
 def format_page(rows: list[dict], factors: list[dict]) -> str:
-    """Return the page of the results."""
+    """Return the results as Markdown."""
     columns = {
         "positions by": "{set_up}",
         "changed": "{changed}",
@@ -86,21 +86,20 @@ def format_page(rows: list[dict], factors: list[dict]) -> str:
         "away, second half": "{away_later_m:.1f}",
         "estimate": "{error_m:.1f}",
     }
-    swept = {changed: f"{{worst_m[{nth}]:.1f}}" for nth, changed in enumerate(FACTOR_CHANGES)}
+    worst = {change: f"{{worst_m[{number}]:.1f}}" for number, change in enumerate(FACTOR_CHANGES)}
     return f"""# The loop of an autopilot that flies by edgevpr
 
-An autopilot that flies by our positions tilts with their errors, and we take its attitude. Simulated autopilots in
-closed loop, a hover 60 m above ground, two minutes each: largest distance of the aircraft from its target in the first
-and in the second half of the flight, and of the autopilot's estimate from the truth, metres. A stable loop does not
-grow.
+An autopilot that flies by our positions tilts with their errors, and we use its attitude. Simulated autopilots hover in
+closed loop, 60 m above ground, for two minutes each. *Away*: largest distance of the aircraft from its target in each
+half of the flight; *estimate*: that of the autopilot's estimate from the truth; metres. In a stable loop, none grows.
 
 {base.format_table(rows, columns, left=2)}
 
-ArduPilot takes the ten positions of a second as independent, and ours are not: they are claimed worse than they are, by
-a factor. The largest distance of the aircraft from its target, metres, by this factor (edgevpr's:
-{navigator.CORRELATION_FACTOR:.1f}). A smaller factor is the more honest claim, and lets the loop run away.
+ArduPilot treats the ten positions of a second as independent, which ours are not: so we multiply their claimed standard
+deviation by a factor ({navigator.CORRELATION_FACTOR:.1f} in edgevpr). Below: the largest distance of the aircraft from
+its target, metres, by this factor. A smaller factor is closer to the true error, but the loop may become unstable.
 
-{base.format_table(factors, {"positions by": "{set_up}", "factor": "{factor:g}", **swept})}
+{base.format_table(factors, {"positions by": "{set_up}", "factor": "{factor:g}", **worst})}
 """
 
 
@@ -109,12 +108,12 @@ def main() -> None:
     for name, (changed, changes) in itertools.product(SET_UPS, CHANGES.items()):
         rows.append({"set_up": name, "changed": f"no GPS, {changed}", **fly_without_gps(name, changes)})
         print(rows[-1], flush=True)
-    for match_every, words in ((1, "a match each second"), (10, "a match each ten seconds"), (None, "no match")):
-        what = {"set_up": "ODOMETRY (ArduPilot)", "changed": f"30 minutes beside good GPS, {words}"}
-        rows.append({**what, **fly_with_gps(match_every)})
+    for match_every, match_text in ((1, "a match each second"), (10, "a match each ten seconds"), (None, "no match")):
+        fields = {"set_up": "ODOMETRY (ArduPilot)", "changed": f"30 minutes beside good GPS, {match_text}"}
+        rows.append({**fields, **fly_with_gps(match_every)})
         print(rows[-1], flush=True)
-    swept = itertools.product([name for name, (vehicle, _) in SET_UPS.items() if "ardu" in vehicle], FACTORS)
-    factors = [{"set_up": name, "factor": factor, "worst_m": fly_with_factor(name, factor)} for name, factor in swept]
+    sweep = itertools.product([name for name, (vehicle, _) in SET_UPS.items() if "ardu" in vehicle], FACTORS)
+    factors = [{"set_up": name, "factor": factor, "worst_m": fly_with_factor(name, factor)} for name, factor in sweep]
     result = {**base.describe_run(), "rows": rows, "factors": factors}
     origin = base.format_origin(result, "python benchmarks/loop.py")
     base.write("loop", result, f"{format_page(rows, factors)}\n{origin}")
