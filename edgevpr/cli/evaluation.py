@@ -110,7 +110,7 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
         raise UsageError(f"--techniques is empty: choose from {', '.join(techniques.list_techniques())}.")
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
-        raise UsageError(f"--form has an unknown format `{unknown[0]}`: choose from {', '.join(FORMS)}.")
+        raise UsageError(f"--form has an unknown value `{unknown[0]}`: choose from {', '.join(FORMS)}.")
     settings = {name: make_camera_setting(name, parse_value(args, "source.camera")) for name in names}
     for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")

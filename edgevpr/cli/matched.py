@@ -20,8 +20,8 @@ _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 def format_match(event: "Recognition") -> dict[str, Any]:
     """Return a query for `match --json`: the fields of its event, except that `position` is the fix (null: none) and
     the best place is one object (null: none was found). `of_place`: the fix is the position of the place itself,
-    because the offset from it is unknown. `from_gps_tag_m`: distance from the fix to the query's own GPS tag; null if
-    either is missing."""
+    because the offset from it is unknown. `on_map_m`: accuracy relative to the map. `from_gps_tag_m`: distance from the
+    fix to the query's own GPS tag; null if either is missing."""
     from edgevpr.core.geodesy import distance_m
     from edgevpr.runtime.recognise.recognition import to_fields
 

@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
         "--offset-s",
         type=float,
         metavar="S",
-        help="seconds to add to the camera's clock (default: inferred time-zone offset) or to the times of subtitles",
+        help="seconds to add to the camera's clock or to the times of subtitles (default: inferred time-zone offset)",
     )
     text = "file to write (default: positions.csv in the folder, or VIDEO.csv)"
     parser.add_argument("--out", metavar="CSV", help=text)

@@ -99,7 +99,7 @@ def add_map_images(parser: ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder of images that the map was built from (repeatable), or its video, or its orthophoto",
+        help="images (folder, repeatable), video or orthophoto that the map was built from",
     )
 
 

@@ -124,7 +124,10 @@ class MatchConfig:
     )
     min_score: float | None = key(None, "--min-score S", "minimum score of an accepted match", limits=(0, 1))
     min_margin: float | None = key(
-        None, "--min-margin M", "minimum margin of an accepted match over the best place elsewhere", limits=(0, 1)
+        None,
+        "--min-margin MARGIN",
+        "minimum lead in score of an accepted match over the best place elsewhere",
+        limits=(0, 1),
     )
     neighbour_m: float = bounded_key(0, 10_000, default=50.0)
     reach_m_s: float | None = key(
@@ -144,7 +147,7 @@ class MemoryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
-    use: bool = key(False, "--salience", "store and match only distinctive (salient) images")
+    use: bool = key(False, "--salience", "use only distinctive (salient) images")
     memorability: float = bounded_key(0, 1, default=0.3)
     staticity: float = bounded_key(0, 1, default=0.6)
     entropy: float = bounded_key(0, 1, default=0.4)

@@ -54,7 +54,7 @@ class ReasonCode(Code):
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
     TILTED_OFF_GROUND = (
         "the image is not levelled",
-        "{summary}: tilted {tilt_deg:.0f} degrees, it shows {visible_share:.0%} of the ground below the camera",
+        "{summary}: tilted {tilt_deg:.0f} degrees, so it shows {visible_share:.0%} of the ground below the camera",
     )
     NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {min_score:.2f} needed"
     UNUSABLE = "unusable", "{problem}"
@@ -135,7 +135,7 @@ class ReasonCode(Code):
     AUTOPILOT_RESTARTED = "the autopilot has restarted"
 
     # The autopilot's answer to fixes, or its silence: "it" is the autopilot, and a summary has at most 26 bytes
-    FIX_ACCEPTED = "accepted", "it accepts them"
+    FIX_ACCEPTED = "accepted", "the autopilot accepts fixes"
     GPS_IN_USE = "GPS in use", "one of its GPS receivers has a fix, and with GPS it accepts no other position"
     NOT_STARTED = "filter not started", "its position filter has not started: on a plane it starts only with GPS"
     NO_ORIGIN = "no origin", "it has no origin, so it accepts no position: it needs GPS once, or an origin sent to it"

@@ -167,12 +167,12 @@ def level_image(
 
     below &= camera.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
     side = min(camera.longest_px, _MAX_SIDE_PX)
-    out_px = camera.focal_px * zoom * side / camera.longest_px  # focal length of the output, in its pixels
+    out_focal_px = camera.focal_px * zoom * side / camera.longest_px  # focal length of the output, in its pixels
     out_from_lens = camera.straight if camera.heading_deg is None else camera.level_from_lens(-camera.heading_deg)
-    middle = np.zeros(2) if below else out_from_lens[:2, 2] / out_from_lens[2, 2] * out_px
+    middle = np.zeros(2) if below else out_from_lens[:2, 2] / out_from_lens[2, 2] * out_focal_px
     right, down = (side - 1) / 2 - middle
-    out_from_ray = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ out_from_lens
-    warp = camera.warp(out_from_ray, out_px, side)
+    out_from_ray = np.array([[out_focal_px, 0, right], [0, out_focal_px, down], [0, 0, 1]]) @ out_from_lens
+    warp = camera.warp(out_from_ray, out_focal_px, side)
 
     width, height = (min(1.0, zoom * px / camera.longest_px) for px in camera.size_px)
     if (filled := warp.visible.mean() / (height * width)) < _MIN_FILLED_FRACTION:
@@ -183,7 +183,7 @@ def level_image(
         up_deg=None if camera.heading_deg is None else 0.0,
         footprint_m=image_m and image_m / zoom,
         zoom=zoom,
-        focal=out_px / side,
+        focal=out_focal_px / side,
         rotation_deg=camera.top_deg or 0.0,
         nadir_offset=(0.0, 0.0) if below and camera.is_tilt_known else camera.nadir_offset(out_from_lens, zoom),
         nadir_offset_sd=camera.nadir_offset_sd(zoom),
@@ -290,12 +290,12 @@ class _CameraGeometry:
             self.corners = clip_polygon(self.corners, depth - _MIN_RAY_DOWN)
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
-    def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:
+    def warp(self, out_from_ray: Doubles, out_focal_px: float, side: int) -> Homography | Remap:
         """Return the warp to (side, side) pixels. `out_from_ray`: homography (3, 3) from rays to pixels of the output,
-        whose focal length is `out_px` pixels."""
+        whose focal length is `out_focal_px` pixels."""
         if self._lens_view:
-            return self._lens_view.make_remap(out_from_ray, out_px, (side, side))
-        return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
+            return self._lens_view.make_remap(out_from_ray, out_focal_px, (side, side))
+        return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_focal_px)
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level image whose top is `up_deg` clockwise from the nose."""

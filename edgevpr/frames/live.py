@@ -122,7 +122,7 @@ class LiveSource(Source):
                 return None
         shot = conversion.shot
         name = f"frame {conversion.number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
-        image = self.stereo.require_single(conversion.image)
+        image = self.stereo.refuse_stereo(conversion.image)
         return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s, delay_sd_s=shot.delay_sd_s)
 
     def close(self) -> None:

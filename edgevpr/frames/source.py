@@ -126,7 +126,7 @@ class FolderSource(RecordingSource):
         if not self._unread:
             self.end()
         try:
-            image = self.stereo.require_single(read_image(path, self._depth))
+            image = self.stereo.refuse_stereo(read_image(path, self._depth))
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise

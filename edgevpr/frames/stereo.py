@@ -32,7 +32,7 @@ class StereoCheck:
         self._is_stereo = False
         self._matching_halves: list[str] = []  # the halves that last matched
 
-    def require_single(self, image: Image) -> Image:
+    def refuse_stereo(self, image: Image) -> Image:
         """Return the image, uint8 (H, W[, 3]), unchanged. Raises ImageError if its halves show the same scene."""
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image

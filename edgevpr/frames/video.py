@@ -87,7 +87,7 @@ class VideoSource(RecordingSource):
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
                 if self.is_selected(name):
                     tag = self._track.interpolate_tag(self._t_s) if self._track else GeoTag()
-                    image = self.stereo.require_single(self._decoder.prepare_conversion(picture)())
+                    image = self.stereo.refuse_stereo(self._decoder.prepare_conversion(picture)())
                     return make_frame(image, name, self._clock(), tag)
             if self._clock() >= deadline_s:
                 break

@@ -62,7 +62,8 @@ class GeoRaster:
         self._bands = self._find_colour_bands()
 
     def _find_colour_bands(self) -> list[int]:
-        """Return the band numbers (from 1) of blue, green and red, or of grey. Raises SourceError."""
+        """Return the band numbers (from 1) of blue, green and red, or of grey. Closes an unusable file and raises
+        SourceError."""
         interpretations, dtypes = self._data.colorinterp, self._data.dtypes
         colours = [interpretations.index(colour) + 1 for colour in _COLOURS if colour in interpretations]
         others = [number for number, kind in enumerate(interpretations, start=1) if kind != ColorInterp.alpha]

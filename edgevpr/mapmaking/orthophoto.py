@@ -39,7 +39,9 @@ class Orthophoto:
         """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads. Raises SourceError."""
         path = Path(source)
         if not path.exists():
-            raise SourceError(f"{source} does not exist: check the path (GDAL can make a file from a tile server).")
+            raise SourceError(
+                f"{source} does not exist: check the path (`gdal_translate` can save a tile server as a file)."
+            )
         if path.is_dir():
             raise SourceError(
                 f"{source} is a folder, but must be a file. GDAL can make one from a folder of tiles "

@@ -139,7 +139,7 @@ class Fixes:
 
     def record_lost(self, count: int) -> None:
         """Record that `count` fixes were lost with the port. They do not count as unanswered, except while sending is
-        stopped, which only an answer ends."""
+        stopped: only an answer ends that state."""
         if not self._is_stopped:
             self._consecutive_unanswered -= count
         self.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))

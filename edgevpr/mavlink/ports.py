@@ -94,7 +94,7 @@ class UdpOutPort(Port):
         return b""
 
     def write(self, data: bytes) -> int:
-        for _ in range(2):
+        for _ in range(2):  # UDP reports the refusal of an earlier datagram: try again
             with suppress(ConnectionRefusedError):
                 return super().write(data)
         return 0

@@ -76,8 +76,8 @@ class PlaceMap(MapConnection):
         """Raise MapError, listing the differences, unless the map's descriptors were made by exactly `spec`."""
         if differences := mapspec.list_differences(self.spec, spec):
             raise MapError(
-                f"{self.path} was made differently ({'; '.join(differences)}): use it with its own technique and "
-                "parameters, or build a map with these."
+                f"{self.path} was made with other settings ({'; '.join(differences)}): use these settings, or "
+                "build a map with the present ones."
             )
 
     def add(

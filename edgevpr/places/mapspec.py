@@ -78,7 +78,7 @@ def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
         name, parameters, model = stored["technique"], dict(stored["parameters"]), stored["model_sha256"]
         coarse, fine, packed = (_parse_part_spec(stored[part]) for part in _PARTS)
         if coarse is None or not isinstance(name, str) or not isinstance(model, str | None):
-            raise ValueError("no coarse part, or a name that is not text")
+            raise ValueError("no coarse part, or the name of technique or network is not text")
         if not all(isinstance(value, int | str) or math.isfinite(value) for value in parameters.values()):
             raise ValueError(f"invalid parameters {parameters!r}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -99,7 +99,7 @@ def list_differences(stored: TechniqueSpec, current: TechniqueSpec) -> list[str]
 
 def _require_columns(path: Path, db: sqlite3.Connection) -> None:
     """Raise MapError unless the table of places has all required columns."""
-    # This list omits generated columns, which are computed when read, so that their size is unlimited.
+    # `table_info` omits generated columns, rightly: computed when read, they could have any size.
     columns = {name: (kind, key) for _, name, kind, _, _, key in db.execute("PRAGMA table_info(places)")}
     missing = [name for name in rows.ALL_COLUMNS.split(", ") if name not in columns]
     if columns.get("place_id") != ("INTEGER", 1):

@@ -96,7 +96,9 @@ class ReplayedDriver:
                 self._outgoing.clear()
                 conversation.handle_port_loss(*count) if event == "lost" else conversation.end()
             case _:
-                raise EdgevprError(f"The tape has an unknown link event, {step}: use the version that recorded it.")
+                raise EdgevprError(
+                    f"The recording has an unknown link event, {step}: use the version that recorded it."
+                )
 
 
 class ReplayedSigning(Signing):

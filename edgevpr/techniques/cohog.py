@@ -114,8 +114,9 @@ class CoHog:
         w1, w2, bins = self.w1, self.w2, self.bins
         if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > placecode.SIDE and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
-                f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
-                f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
+                f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1, the side of the image, must be a multiple of w2, "
+                f"the side of a region, at most 4096 pixels, and more than {placecode.SIDE} regions; w2 must be at "
+                "least 2 pixels, and bins 2 to 64."
             )
         if self.camera == "nadir" and bins != tuning.NADIR_BINS:
             raise UsageError(f"cohog with `camera` nadir uses {tuning.NADIR_BINS} bins, not {bins}: omit `bins`.")

@@ -234,11 +234,11 @@ def test_stereo_check_refuses_side_by_side_images(join, shift_px):
     for step in range(12):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
         with pytest.raises(ImageError, match=r"halves .*videocrop"):
-            check.require_single(join(make_stereo_pair(scene, shift_px)))
+            check.refuse_stereo(join(make_stereo_pair(scene, shift_px)))
     for _ in range(10):
         with contextlib.suppress(ImageError):
-            check.require_single(SCENE.astype(np.uint8))
-    check.require_single(SCENE.astype(np.uint8))
+            check.refuse_stereo(SCENE.astype(np.uint8))
+    check.refuse_stereo(SCENE.astype(np.uint8))
 
 
 def test_stereo_check_accepts_repetitive_ground():
@@ -252,7 +252,7 @@ def test_stereo_check_accepts_repetitive_ground():
         for turned in (picture, picture.T.copy()):
             check = StereoCheck()
             for _ in range(15):
-                check.require_single(turned)
+                check.refuse_stereo(turned)
 
 
 def test_folder_of_stereo_pictures_gives_no_frame(tmp_path):

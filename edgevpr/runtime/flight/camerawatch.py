@@ -81,7 +81,7 @@ class MirrorWatch:
             self._notifier.report("camera", Severity.WARNING, note, topic="mirror")
 
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
-        """Search the whole map for the flipped image, without using any state of the flight."""
+        """Return True if the mirrored image matches anywhere in the map, without the state of the flight."""
         assert event.frame is not None
         base, settings = self._recogniser, MatchSettings(candidates=self._recogniser.candidates)
         fresh = Recogniser(base.encoder, base.place_map, Matcher(base.index, base.rule), self._meter, settings=settings)

@@ -138,7 +138,7 @@ class Recording(Tape):
         if disk.f_bavail * disk.f_frsize < MIN_FREE_BYTES:
             raise OSError(errno.ENOSPC, f"less than {MIN_FREE_BYTES // 1_000_000} MB free on the disk")
         if self._bytes_written + os.fstat(self._tape.fileno()).st_size > self._max_bytes:
-            raise OSError(errno.EFBIG, "it is as large as half of log.record_mb allows")
+            raise OSError(errno.EFBIG, "it has reached its limit, half of log.record_mb")
         append_bytes(self._tape, b"".join(notes))
         sync_file(self._tape)
 

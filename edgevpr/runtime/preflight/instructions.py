@@ -29,8 +29,8 @@ def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | N
 
 
 def compute_costs(costs: TechniqueCosts, board: Board, work: Mapping[str, float] | None) -> TechniqueCosts | None:
-    """Return `costs`, measured on this machine, with the times of one core of another board, computed from the
-    instruction counts `work`; None if these or the board's `arm64_mips` are unknown."""
+    """Return a copy of `costs`, which were measured on this machine, with the times of one core of `board`, estimated
+    from the instruction counts `work`; None if these or the board's `arm64_mips` are unknown."""
     mips = board.benchmark_score.arm64_mips
     if work is None or mips is None:
         return None

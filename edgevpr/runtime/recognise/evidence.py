@@ -218,9 +218,9 @@ def count_neighbours(look_alikes: LookAlikes | None) -> int:
 
 
 def log_inlier_ratio(inliers: int, rival: int) -> float:
-    """Return the evidence from landmarks (ahead): the logarithm of the ratio of `inliers`, the number that agree with
-    the best place, to `rival`, the number that agree with the best place elsewhere. Both are raised to the number
-    expected by chance. The result is at least 0, so it never counts against a match."""
+    """Return the evidence from landmarks of forward cameras: the logarithm of the ratio of `inliers`, the number that
+    agree with the best place, to `rival`, the number that agree with the best place elsewhere. Both are raised to the
+    number expected by chance. The result is at least 0, so it never counts against a match."""
     return max(0.0, math.log(max(inliers, CHANCE_INLIERS) / max(rival, CHANCE_INLIERS)))
 
 

@@ -170,10 +170,10 @@ class Prior(RecordedPrior):
     def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; None if there are none, or if hints are not trusted now.
 
-        `vehicle` is the autopilot's last report. The radius of the area is the farthest that the aircraft can have
-        flown plus `margin_m`. Its centre is the autopilot's position if that has GPS (without GPS it drifts, and our
-        own fix is better), or else our last fix if at most a minute old. If no maximum speed is set, the area is around
-        the position from the place filter, if that is certain.
+        `vehicle` is the autopilot's last report. The radius of the area (`reach`) is the farthest that the aircraft can
+        have flown plus `margin_m`. Its centre is the autopilot's position if that has GPS (without GPS it drifts, and
+        our own fix is better), or else our last fix if at most a minute old. If no maximum speed is set, the area is
+        around the position from the place filter, if that is certain.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None

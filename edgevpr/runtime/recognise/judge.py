@@ -159,10 +159,10 @@ def make_accept_rule(
 ) -> AcceptRule:
     """Return the rule for a technique: by confidence if there is a model for its evidence, otherwise by its own limits.
     Limits in the configuration take precedence. `calibration` is that of the map (None: use the default models). A
-    sequence of `length` queries is judged by limits; its margin is that of one query over the square root of its length
-    (at most 10, because queries of the same ground are not independent)."""
+    sequence of `length` queries is judged by limits; its margin is that of one query divided by the square root of its
+    length (10 if longer, because queries of the same ground are not independent)."""
     kinds = list_evidence_kinds(technique.spec) if length == 1 else ()
-    # With a confidence, no lead is needed: the flight so far may decide between two similar places.
+    # With a confidence rule, no lead is needed: the flight so far may decide between two similar places.
     min_score, min_margin = (0.0, -math.inf) if kinds else (technique.min_score, technique.min_margin)
     if min_margin < 1:  # a margin of 1 or more accepts nothing, even in sequences
         min_margin /= math.sqrt(min(length, _MAX_INDEPENDENT))

@@ -115,8 +115,8 @@ class PlaceFilter:
         self._odometry: OdometryStep | None = None
 
     def predict(self, frame: Frame, vehicle: Vehicle | None, odometry: OdometryStep | None = None) -> None:
-        """Set the time and the motion since the last committed pass, if known: the motion measured by `odometry` since
-        the previous frame or, without it, derived from the velocity reported by the autopilot."""
+        """Store the time of the next query and the motion since the last committed one, for `update`: the motion
+        measured by `odometry` since the previous frame or, without it, derived from the autopilot's velocity."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_committed_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s

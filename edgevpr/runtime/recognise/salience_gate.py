@@ -104,7 +104,7 @@ def select_best(shortfalls: list[float]) -> list[bool]:
 
 
 def compute_scores(image: Image, memorability: Memorability | None = None, is_static: Mask | None = None) -> Salience:
-    """Return the scores of uint8 (H, W[, 3]): means over the pixels of a copy whose longer side has at most 320.
+    """Return the scores of an image, uint8 (H, W[, 3]): means over a copy with a longer side of at most 320 pixels.
     Pixels that are not static count as 0 in the other two scores, because an image with many of them is less useful.
 
     `is_static`, bool (H, W), is the detector's result for the image (None: no detector). Raises ModelError.

@@ -31,7 +31,7 @@ def measure_queries(*queries):
 
 def test_compute_quality_of_a_perfect_run_with_ties():
     found = measure_queries((0.9, 0), (0.9, 0), (0.5, 0), (0.5, 0))
-    assert (found.auc_from_zero, found.auc_2_3) == (1, 0.5), "2.3 takes half of it for the ties"
+    assert (found.auc_from_zero, found.auc_2_3) == (1, 0.5), "equation 2.3 of the thesis counts ties as half"
     assert (found.ep, found.precision_at_100_recall, found.roc_auc) == (1, 1, None)
     assert found.recall_at_100_precision_vpr_bench == found.recall_at_100_precision_vpr_tutorial == 1
     assert (found.queries_off_map, found.with_match) == (0, None)

@@ -65,8 +65,8 @@ class Flight:
         self.follower.predict(Frame(image=BLANK, name="", t_mono_s=self.t_s), vehicle, stride)
 
     def handle(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
-        """A look whose best place is this one (a number between two is one between two places). 80 landmarks agree with
-        it, and `rival` with a place elsewhere."""
+        """Update the filter with a query whose best place is `place`; 2.5 is halfway between places 2 and 3. 80
+        landmarks agree with it, and `rival` with a place elsewhere."""
         best = round(place)
         others = [slot for slot in others or _choose_similar(best, len(self.index)) if slot != best]
         slots = np.array([best, *others], int)

@@ -83,7 +83,7 @@ def test_check_device_refuses_what_is_not_a_device(root):
         (5000, "camera", "sudo usermod --append --groups 5000 USER"),
     ],
 )
-def test_check_device_without_access_advises_a_group_unless_it_is_of_the_system(root, monkeypatch, gid, what, change):
+def test_check_device_without_access_advises_a_group_unless_it_is_a_system_group(root, monkeypatch, gid, what, change):
     null, status = os.stat("/dev/null"), Path.stat
     owned = os.stat_result([*null[:5], gid, *null[6:]], {"st_rdev": null.st_rdev})
     monkeypatch.setattr(os, "access", lambda *_: False)
