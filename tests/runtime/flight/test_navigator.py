@@ -1,6 +1,7 @@
 """What is worth being sent: with a true path beside it, an aircraft that takes what is sent is never worse off."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -215,3 +216,7 @@ def test_report_accuracy_contains_the_attitude_error_that_images_show(shown_sd, 
         navigator.advise(event, t_s)
     reported = navigator.report_accuracy(event)
     assert reported.accuracy_m == pytest.approx(math.hypot(1.0, height_m * attitude_sd), rel=0.25)
+    without_report, unlocated = replace(event, vehicle=None), replace(event, located=None)
+    assert navigator.report_accuracy(without_report).accuracy_m == reported.accuracy_m, "by the newest report"
+    assert navigator.report_accuracy(unlocated) is unlocated
+    assert Navigator(1.0, 1.0).report_accuracy(without_report) is without_report, "there is no report"
