@@ -123,6 +123,7 @@ def measure_queries() -> Iterator[Row]:
 
 
 def _time_query(opened: tuple[Technique, PlaceMap, PlaceIndex], camera: str, prior: str, expected: Expectation) -> Row:
+    """Return the median times of a query with what is `expected`, in an open map; `prior` describes it."""
     technique, place_map, index = opened
     picture = load_frames()[0]
 

@@ -126,9 +126,9 @@ def score_answers(answers: list[Answer]) -> tuple[np.ndarray, np.ndarray]:
     """Return the score of the best place that is not ignored, and whether it is right, for each query, (Q,) each."""
     best_scores, is_right = [], []
     for slots, scores, right, ignored in answers:
-        counts = ~ignored[slots]
-        best_scores.append(float(scores[counts][0]) if counts.any() else 0.0)
-        is_right.append(bool(right[slots[counts][0]]) if counts.any() else False)
+        is_candidate = ~ignored[slots]
+        best_scores.append(float(scores[is_candidate][0]) if is_candidate.any() else 0.0)
+        is_right.append(bool(right[slots[is_candidate][0]]) if is_candidate.any() else False)
     return np.array(best_scores), np.array(is_right)
 
 

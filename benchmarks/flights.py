@@ -106,7 +106,7 @@ MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A planned flight. `number` seeds it; `other` is the site whose ground is below it off the map."""
+    """A planned flight. `number` seeds it; `other` is the site that it flies over off the map."""
 
     number: int
     site: str
@@ -280,10 +280,9 @@ def format_page(result: Row) -> str:
 
 {base.strip_title(__doc__)}
 
-Right, wrong and far off are numbers of fixes. Lost: share of the time over the map. Gap: longest time over the map
-without a right fix, median / worst of the flights. Error: median / 95th percentile of right fixes. Within: share of the
-errors, axis by axis, within one and two claimed standard deviations (should be 0.68 and 0.95), of all fixes over the
-site's own ground.
+Right, wrong, far off: numbers of fixes. Lost: share of the time over the map. Gap: longest time over the map without a
+right fix, median / worst of the flights. Error: median / 95th percentile of right fixes. Within: share of the errors,
+per axis, within one and two claimed standard deviations (ideally 0.68 and 0.95), of all fixes over the site itself.
 
 {tables[0]}
 

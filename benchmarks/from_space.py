@@ -140,7 +140,7 @@ def yield_foreign_frames(folder: Path) -> Iterator[Frame]:
 
 
 def match_frames(path: Path, frames: Iterable[Frame], known: str, fov_deg: float = FOV_DEG) -> Row:
-    """Match each frame, with nothing, heading and height, or the flight so far `known`, and return the figures."""
+    """Match each frame by what is `known`: nothing, heading and height, or the flight so far. Returns the figures."""
     knows_pose, knows_flight = known == _POSE_KNOWN, known == _FLIGHT_KNOWN
     lens, prior = ({"source.fov_deg": fov_deg}, ("heading", "height")) if knows_pose else ({}, ())
     config = walks.make_config(map=str(path), **{"source.camera": "nadir"}, **lens)

@@ -75,8 +75,7 @@ KINDS: dict[str, Callable[[Path, Rng], None]] = {
 
 def run(count: int, seed: int) -> list[Row]:
     """Try `count` damaged maps, the kinds in turn, in flight, at take-off, with the commands and with a repair. Returns
-    a row a kind: commands or flights that ended with a traceback, queries accepted at a wrong position, and readable
-    places that a repair lost."""
+    a row a kind: tracebacks, queries accepted at a wrong position, and readable places that a repair lost."""
     rows = [{"kind": kind, "tried": 0, "tracebacks": 0, "wrong_positions": 0, "places_lost": 0} for kind in KINDS]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

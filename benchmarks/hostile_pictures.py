@@ -80,6 +80,7 @@ def _match_queries(folder: Path, queries: Iterator[Query], counts: dict[str, Row
 
 
 def _yield_plain(dataset: Dataset, folders: list[Path], count: int, rng: Rng, seed: int) -> Iterator[Query]:
+    """Yield the queries without an overlay: of nothing, spoilt, of other sites, and of the other camera."""
     for _, image in yield_pictures(seed, count):
         yield "of nothing", image, frozenset()
     queries = -(-count // len(SPOILT))
