@@ -1,5 +1,5 @@
-/* Plug-in of QEMU: counts the instructions of an aarch64 program. At each call of getppid(), which the program makes to
-   mark a point, it prints how many there were since the start. The interface is that of qemu-plugin.h, version 1. */
+/* A QEMU plug-in that counts the instructions of an aarch64 program. At each call of getppid(), by which the program
+   marks a point, it prints the count since the start. The interface is that of qemu-plugin.h, version 1. */
 
 #include <inttypes.h>
 #include <stdio.h>
@@ -19,13 +19,13 @@ extern size_t qemu_plugin_tb_n_insns(const struct tb *);
 int qemu_plugin_version = 1;
 static uint64_t instructions;
 
-static void translated(plugin_id id, struct tb *tb)
+static void count_block(plugin_id id, struct tb *tb)
 {
     qemu_plugin_register_vcpu_tb_exec_inline(tb, ADD_U64, &instructions, qemu_plugin_tb_n_insns(tb));
 }
 
-static void called(plugin_id id, unsigned cpu, int64_t number, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
-                   uint64_t e, uint64_t f, uint64_t g, uint64_t h)
+static void print_count(plugin_id id, unsigned cpu, int64_t number, uint64_t a, uint64_t b, uint64_t c, uint64_t d,
+                        uint64_t e, uint64_t f, uint64_t g, uint64_t h)
 {
     if (number == GETPPID)
         fprintf(stderr, "%" PRIu64 "\n", instructions);
@@ -33,7 +33,7 @@ static void called(plugin_id id, unsigned cpu, int64_t number, uint64_t a, uint6
 
 int qemu_plugin_install(plugin_id id, const struct info *info, int argc, char **argv)
 {
-    qemu_plugin_register_vcpu_tb_trans_cb(id, translated);
-    qemu_plugin_register_vcpu_syscall_cb(id, called);
+    qemu_plugin_register_vcpu_tb_trans_cb(id, count_block);
+    qemu_plugin_register_vcpu_syscall_cb(id, print_count);
     return 0;
 }

@@ -1,19 +1,19 @@
-"""The instructions of `cohog` by what a flight does with them, from those of the parts that `work.py` names: the file
-by which `edgevpr profile` estimates ARM boards."""
+"""Instruction counts of `cohog` by stage of a flight, computed from the counts of the parts in `work.py`: the content
+of the file by which `edgevpr profile` estimates the speed of ARM boards."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from edgevpr.techniques import create
 
-# The two maps whose scans were counted.
+# Sizes of the two maps whose scans are counted.
 SMALL_MAP_PLACES = 1_000
 LARGE_MAP_PLACES = 10_000
 _CAMERAS = {"forward": "ahead", "nadir": "down"}
 
 
 def compute_counts(parts: Mapping[str, float]) -> dict[str, Any]:
-    """Return the content of the file."""
+    """Return the content of the file; `parts` are instruction counts by the name of the part."""
     content: dict[str, Any] = {}
     for camera, name in _CAMERAS.items():
         encode = parts[f"{name}: encode a frame"]
@@ -23,7 +23,7 @@ def compute_counts(parts: Mapping[str, float]) -> dict[str, Any]:
         technique = create("cohog", {"camera": camera})
         full = technique.spec.max_matches * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
         landmarks = 0.0
-        if camera == "nadir":  # those of the frame, held against the best place's and the last frame's
+        if camera == "nadir":  # of the frame; matched with those of the best place and of the last frame
             landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]
         work = {
             "encode": encode,

@@ -1,7 +1,7 @@
-"""The parts of a query, once each: what `bench_arm64.py` counts under emulation.
+"""The parts of a query, whose instructions `bench_arm64.py` counts under emulation.
 
-`python work.py AHEAD.gpkg DOWN.gpkg` marks the beginning and the end of each part by a call of getppid(), which costs
-next to nothing, and prints its name.
+`python work.py FORWARD.gpkg NADIR.gpkg` runs each part, marks its start and end by a call of getppid(), which costs
+almost nothing, and prints its name.
 """
 
 import os
@@ -25,21 +25,21 @@ from edgevpr.techniques import create
 ARRAYS_BY_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
 
 
-def list_parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield the name of each part, and a function that does it."""
-    yield from list_query_parts("ahead", "forward", ahead)
-    yield from list_query_parts("down", "nadir", down)
+def list_parts(forward_map: str, nadir_map: str) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield the name of each part and a function that runs it."""
+    yield from list_query_parts("ahead", "forward", forward_map)
+    yield from list_query_parts("down", "nadir", nadir_map)
     yield from list_landmark_parts(_make_picture(np.random.default_rng(0)))
 
 
 def _make_picture(rng: np.random.Generator) -> Image:
-    """Return noise, smoothed and stretched: nearly all regions are good, as over a town."""
+    """Return smoothed noise with stretched contrast: nearly all its regions have enough texture, as over a town."""
     noise = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
     return cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
 
 
 def list_query_parts(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield the parts of a query of `cohog` in one map."""
+    """Yield the parts of a query of `cohog` in the map at `path`."""
     rng = np.random.default_rng(0)
     picture = _make_picture(rng)
     technique = create("cohog", {"camera": camera})
@@ -54,7 +54,7 @@ def list_query_parts(name: str, camera: str, path: str) -> Iterator[tuple[str, C
             encoded = technique.encode(picture)
             return Query(technique=technique, descriptor=encoded, place_map=place_map, index=places, expected=expected)
 
-        def answer(expected: Expectation) -> object:
+        def match(expected: Expectation) -> object:
             query = encode(index, expected)
             return compare_places(query, scan_index(query), technique.candidates, 0.0)
 
@@ -64,21 +64,21 @@ def list_query_parts(name: str, camera: str, path: str) -> Iterator[tuple[str, C
         yield f"{name}: compare a place in full", lambda: technique.match(descriptor, fine, rotations)
         yield f"{name}: encode, and scan {len(small)} places", lambda: scan_index(encode(small))
         yield f"{name}: encode, and scan {len(index)} places", lambda: scan_index(encode(index))
-        yield f"{name}: a query", lambda: answer(NO_EXPECTATION)
+        yield f"{name}: a query", lambda: match(NO_EXPECTATION)
         if camera == "nadir":
-            yield f"{name}: a query, heading known", lambda: answer(heading_known)
+            yield f"{name}: a query, heading known", lambda: match(heading_known)
 
 
 def list_landmark_parts(picture: Image) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield what a flight does besides queries: the landmarks of a frame, and its step of visual odometry."""
+    """Yield the parts of a flight besides queries: landmarks of a frame, and a step of visual odometry."""
     moved = cv2.warpAffine(picture, np.float32([[1, 0, 40], [0, 1, 15]]), picture.shape[::-1])
     view = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0), focal=0.77)
-    before, now = detect_landmarks(picture, None, QUERY_LANDMARKS), detect_landmarks(moved, None, QUERY_LANDMARKS)
+    before, after = detect_landmarks(picture, None, QUERY_LANDMARKS), detect_landmarks(moved, None, QUERY_LANDMARKS)
 
     def measure_step() -> object:
         odometry = VisualOdometry()
         odometry.measure(0.0, view, before)
-        if (step := odometry.measure(1.0, view, now)) is None:
+        if (step := odometry.measure(1.0, view, after)) is None:
             raise RuntimeError("visual odometry found no step")
         return step
 

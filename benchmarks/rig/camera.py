@@ -1,8 +1,8 @@
-"""A camera under the aircraft: pictures of the ground from the true pose, served over HTTP on loopback.
+"""A simulated camera under the aircraft: renders the ground from the true pose and serves the pictures over HTTP.
 
-They are Motion JPEG in NUT, a container of FFmpeg's that gives every picture its time; or without times, one after the
-other in the parts of an answer, as cheap cameras do. A picture is rendered for a moment shortly ahead and leaves at
-that moment, so it is as if it had been taken then.
+The stream on loopback is Motion JPEG in NUT, an FFmpeg container with a time stamp for each picture, or a multipart
+HTTP response without time stamps, as of cheap cameras. Each picture is rendered shortly in advance for its time of
+exposure and sent at that time, so that rendering adds no delay.
 """
 
 import contextlib
@@ -26,16 +26,16 @@ from edgevpr.frames.level import Mount
 from edgevpr.lab.simulate.camera import CameraPose
 
 PICTURES_HZ = 5.0
-_RENDER_LEAD_S = 0.08  # rendering takes 20 to 60 ms
-_STAMP_UNIT_S = Fraction(1, 10_000)  # of the time stamps, in seconds
-_MAX_TILT_DEG = 60.0  # a picture that is tilted farther shows the sky
-_SLOPE_LENGTH_M = 80.0  # beyond the map, the ground comes to its other height on so many metres
+_RENDER_LEAD_S = 0.08  # more than rendering takes, 20 to 60 ms
+_STAMP_UNIT_S = Fraction(1, 10_000)  # unit of the time stamps, in seconds
+_MAX_TILT_DEG = 60.0  # a camera that is tilted more shows the sky
+_SLOPE_LENGTH_M = 80.0  # beyond the map, the ground slopes to its other height over this distance
 COLUMNS = ("t_s", "east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture and the time at which it is taken."""
+    """A picture, its number, and its time of exposure on the monotonic clock."""
 
     number: int
     t_mono_s: float
@@ -43,9 +43,9 @@ class Picture:
 
 
 class Camera:
-    """Serves pictures at `uri` from the begin of the `with` block to its end, and writes the true pose of each to a
-    file: that of the airframe. `seed` is that of the noise, the `scenario` says how the camera is mounted, what it
-    sees, and if the pictures have their times. While it `is_frozen`, it gives its last picture again."""
+    """Serves pictures at `uri` within the `with` block, and writes the true pose of the airframe at each picture to the
+    file `log`. `seed` is the seed of the noise; the `scenario` has the mount of the camera, what it sees, and whether
+    pictures have time stamps. While the camera `is_frozen`, it repeats its last picture."""
 
     def __init__(self, truth: Truth, lit_ground: np.ndarray, log: Path, seed: int, scenario: Scenario) -> None:
         self._truth, self._ground, self._scenario, self.is_stamped = truth, lit_ground, scenario, scenario.is_stamped
@@ -72,7 +72,7 @@ class Camera:
         self._server.server_close()
 
     def wait_picture(self, after: int) -> Picture | None:
-        """Wait for a picture after that of a number; None where the camera is off."""
+        """Wait for a picture with a number greater than `after` and return it; None if the camera is off."""
         with self._changed:
             self._changed.wait_for(lambda: (self._picture and self._picture.number > after) or not self._is_on)
             return self._picture if self._is_on else None
@@ -83,7 +83,7 @@ class Camera:
         with open(self._log, "w", encoding="utf-8", buffering=1) as log:
             log.write(",".join(COLUMNS) + "\n")
             while self._is_on:
-                due_s = max(due_s + 1 / PICTURES_HZ, time.monotonic())  # what was missed is left out
+                due_s = max(due_s + 1 / PICTURES_HZ, time.monotonic())  # skips pictures that are overdue
                 time.sleep(max(0.0, due_s - _RENDER_LEAD_S - time.monotonic()))
                 pose = self._truth.compute_pose(due_s)
                 if pose is None:
@@ -107,19 +107,19 @@ class Camera:
         if self._scenario.is_level:
             pose = replace(pose, roll_deg=0.0, pitch_deg=0.0)
         elif max(abs(pose.roll_deg), abs(pose.pitch_deg)) > _MAX_TILT_DEG:
-            pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # nothing to be seen
+            pose = replace(pose, height_m=1.0, roll_deg=0.0, pitch_deg=0.0)  # too low to show anything
         return ground.take_picture(self._ground, apply_mount(pose, self._scenario.mount), "later", self._rng)
 
     def _compute_ground_scale(self, north_m: float) -> float:
-        """Return by how much farther below the ground lies there than where it is mapped."""
+        """Return the height above ground at `north_m`, divided by the height above the mapped ground."""
         if self._scenario.mapped_m is None:
             return 1.0
-        beyond = min(max((north_m - self._scenario.mapped_m) / _SLOPE_LENGTH_M, 0.0), 1.0)
-        return 1.0 + beyond * (self._scenario.beyond_scale - 1.0)
+        slope_share = min(max((north_m - self._scenario.mapped_m) / _SLOPE_LENGTH_M, 0.0), 1.0)
+        return 1.0 + slope_share * (self._scenario.beyond_scale - 1.0)
 
 
 def _make_noise_jpeg(rng: np.random.Generator) -> bytes:
-    """Return a picture that no map knows, as a JPEG."""
+    """Return a picture of smooth noise, which matches no map, as a JPEG."""
     camera = ground.CAMERAS["later"]
     grains = rng.integers(0, 255, (camera.height // 8, camera.width // 8, 3), np.uint8)
     noise = cv2.resize(grains, (camera.width, camera.height), interpolation=cv2.INTER_CUBIC)
@@ -127,16 +127,16 @@ def _make_noise_jpeg(rng: np.random.Generator) -> bytes:
 
 
 def apply_mount(pose: CameraPose, mount: Mount) -> CameraPose:
-    """Return the pose of a camera that is mounted so under an airframe of that pose."""
-    about_down = cv2.Rodrigues(np.radians((0.0, 0.0, pose.heading_deg)))[0]
-    body = Mount(pose.pitch_deg, -pose.roll_deg).body_from_straight()
-    (nose, *_), (right, *_), (down, *below) = about_down @ body @ mount.body_from_straight()
+    """Return the pose of a camera with this mount, from the pose of the airframe."""
+    heading = cv2.Rodrigues(np.radians((0.0, 0.0, pose.heading_deg)))[0]
+    attitude = Mount(pose.pitch_deg, -pose.roll_deg).body_from_straight()
+    (nose, *_), (right, *_), (down, *below) = heading @ attitude @ mount.body_from_straight()
     angles = math.atan2(right, nose), math.atan2(*below), -math.asin(down)
     return replace(pose, **dict(zip(("heading_deg", "roll_deg", "pitch_deg"), map(math.degrees, angles), strict=True)))
 
 
 class _Viewer(BaseHTTPRequestHandler):
-    server: Any  # with the `camera`
+    server: Any  # an HTTP server with an attribute `camera`
 
     def log_message(self, *_: object) -> None:
         pass
@@ -146,7 +146,7 @@ class _Viewer(BaseHTTPRequestHandler):
         self.send_response(200)
         self.send_header("Content-Type", "video/x-nut" if is_stamped else "multipart/x-mixed-replace; boundary=picture")
         self.end_headers()
-        with contextlib.suppress(OSError, av.FFmpegError):  # the viewer has gone
+        with contextlib.suppress(OSError, av.FFmpegError):  # the viewer has disconnected
             if is_stamped:
                 self._send_stamped()
             else:
@@ -155,8 +155,8 @@ class _Viewer(BaseHTTPRequestHandler):
     def _send_parts(self) -> None:
         picture = self.server.camera.wait_picture(0)
         while picture:
-            head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n"
-            self.wfile.write(head.encode() + picture.jpeg + b"\r\n")
+            header = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n"
+            self.wfile.write(header.encode() + picture.jpeg + b"\r\n")
             picture = self.server.camera.wait_picture(picture.number)
 
     def _send_stamped(self) -> None:
@@ -178,7 +178,7 @@ class _Viewer(BaseHTTPRequestHandler):
 
 
 class _Sink:
-    """A file that FFmpeg can only write to."""
+    """A write-only file for FFmpeg, which must not seek."""
 
     def __init__(self, file) -> None:
         self._file = file

@@ -1,4 +1,4 @@
-"""The table of the sweep: set-ups, events, and which of them are flown together, each beside its control."""
+"""The table of the sweep: set-ups, events, their combinations (cells), and the control flight of each cell."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -7,18 +7,18 @@ from typing import Any
 from scenarios import AGP, GPS_INPUT, ODOMETRY, Scenario
 
 WATCH_S = 120.0
-MAP_END_M = 500.0  # north: what is flown over beyond it is in no map, where the ground changes its height
-CENTRE_M = (700.0, 500.0)  # of a plane's circle, half of which lies beyond that end
+MAP_END_M = 500.0  # northern end of the map; beyond it the height of the ground changes
+CENTRE_M = (700.0, 500.0)  # of a plane's circle, half of which is beyond the end of the map
 RADIUS_M = 200.0
-HOVER_AT_M = (600.0, 450.0)  # of a copter
-LEG_M = ((700.0, 320.0), (700.0, 900.0))
+HOVER_AT_M = (600.0, 450.0)  # where a copter hovers
+LEG_M = ((700.0, 320.0), (700.0, 900.0))  # the leg of a copter that leaves the map
 PLANE_HOME_M = (300.0, 500.0)
 ODOMETRY_SET = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetUp:
-    """An autopilot and its `parameters` for edgevpr, `common` ones with edgevpr and without, and edgevpr's `config`."""
+    """An autopilot: its `parameters` for edgevpr only, `common` ones for the control, too, and edgevpr's `config`."""
 
     vehicle: str = "copter"
     is_px4: bool = False
@@ -28,19 +28,19 @@ class SetUp:
 
     @property
     def control_name(self) -> str:
-        """The name of the same autopilot without edgevpr."""
+        """The name of the set-up of the same autopilot without edgevpr."""
         return f"{'px4_' * self.is_px4}{self.vehicle}"
 
     @property
     def sends_with_gps(self) -> bool:
-        """True if edgevpr sends positions while the autopilot has GPS too."""
+        """True if edgevpr also sends positions while the autopilot has GPS."""
         return bool({"GPS2_TYPE", "VISO_TYPE"} & set(self.parameters))
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What happens `at_s` after the begin of the watched time: `action` is the name of a method of `Trial`, `values`
-    are its arguments."""
+    """An action of an event, `at_s` after the start of the watched time: `action` is the name of a method of `Trial`,
+    `values` are its arguments."""
 
     at_s: float
     action: str
@@ -49,13 +49,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """What happens in a flight: `before`, on the ground (actions and values), and `steps`.
+    """What happens in a flight: actions (with values) `before` take-off, and `steps` in flight.
 
-    The control is the same flight without edgevpr, or with `control_has_edgevpr` one with it; `control` names its event
-    (None: this one). From `gps_back_s` on GPS is as it was; from `silent_s` on edgevpr must send no position. An
-    aircraft that `leaves_map` flies along LEG_M (copter) or on its circle, and the map ends at MAP_END_M; beyond it the
-    ground lies `beyond_scale` times as far below. `parameters_come_late`: the autopilot has the parameters of the
-    set-up only by the action `adopt`."""
+    The control is the same flight without edgevpr, or also with edgevpr if `control_has_edgevpr`; `control` names its
+    event (None: this one). GPS works again from `gps_back_s`; from `silent_s`, edgevpr must send no position. With
+    `leaves_map`, a copter flies along LEG_M, a plane on its circle, and the map ends at MAP_END_M; beyond it the ground
+    is `beyond_scale` times as far below. With `parameters_come_late`, the autopilot gets the parameters of the set-up
+    only by the action `adopt`."""
 
     steps: tuple[Step, ...] = ()
     before: tuple[tuple[str, tuple[float, ...]], ...] = ()
@@ -70,7 +70,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One flight: the names of a set-up and an event, and the kind of matches ("" without edgevpr)."""
+    """One flight: the names of its set-up and event, and the kind of its matches (of MATCHES; "" without edgevpr)."""
 
     set_up: str
     event: str
@@ -85,9 +85,9 @@ class Flight:
         return bool(self.matches)
 
     def make_scenario(self) -> Scenario:
-        """Return what the rig needs to know of it."""
+        """Return the scenario of the flight, for the rig."""
         set_up, event = SET_UPS[self.set_up], EVENTS[self.event]
-        # A map that is off claims the usual accuracy, not that of the rig, whose places are known to a metre.
+        # A displaced map claims the usual accuracy, not that of the rig's own map, whose places are exact to a metre.
         accuracy = {"min_accuracy_m": 5.0} if self.matches in ("displaced", "wrong") else {}
         homes_m = {"plane": PLANE_HOME_M, "copter": LEG_M[0] if event.leaves_map else HOVER_AT_M}
         return Scenario(
@@ -105,14 +105,14 @@ class Flight:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A flight of the table; `is_quick`: also of the part of ten minutes."""
+    """A flight of the table; `is_quick`: it is also in the part of ten minutes."""
 
     flight: Flight
     is_quick: bool = False
 
     @property
     def control(self) -> Flight:
-        """The flight that it is compared with."""
+        """The flight that this one is compared with."""
         event = EVENTS[self.flight.event]
         event_name = event.control or self.flight.event
         if event.control_has_edgevpr:
@@ -122,9 +122,9 @@ class Cell:
 
 MATCHES = {"right": {}, "none": {"is_blind": True}, "displaced": {"map_east_m": 8.0}, "wrong": {"map_east_m": 300.0}}
 
-_GPS_WANDER_SHARE = 0.3  # of the noise of PX4's receiver: at 1 a hover strays by 3 m, as much as a cell may be worse
+_GPS_WANDER_SHARE = 0.3  # share of PX4's GPS noise; with all of it a hover strays by 3 m, the margin of a cell
 _VEHICLE_PARAMETERS = {
-    "copter": {"WPNAV_SPEED_UP": 500, "WPNAV_SPEED": 700, "GPS1_TYPE": 5, "SIM_GPS1_TYPE": 5},  # NMEA: a plain 3D fix
+    "copter": {"WPNAV_SPEED_UP": 500, "WPNAV_SPEED": 700, "GPS1_TYPE": 5, "SIM_GPS1_TYPE": 5},  # NMEA: only 3D fixes
     "plane": {"TKOFF_ALT": 60, "WP_LOITER_RAD": RADIUS_M},
     "px4_copter": {
         "MPC_TKO_SPEED": 5.0,
@@ -216,7 +216,7 @@ EVENTS = {
 
 
 def _make_cells(set_up: str, events: str, matches: str = "right") -> list[Cell]:
-    """Return the cells of a set-up and several events; those with a `*` are of the quick part."""
+    """Return the cells of a set-up and of event names; those with a `*` are also in the quick part."""
     names = ((event.rstrip("*"), event.endswith("*")) for event in events.split())
     return [Cell(Flight(set_up, event, matches), is_quick) for event, is_quick in names]
 

@@ -1,4 +1,4 @@
-"""One run of a scenario: the simulator, the camera and edgevpr between them, and a record of it all in a folder."""
+"""One run of a scenario with the simulator, the camera, and edgevpr between them, recorded in a folder."""
 
 import json
 import math
@@ -32,15 +32,15 @@ from edgevpr.mavlink.wire import mavlink
 
 LOOP_STEP_S = 0.1
 _SHIFTED_CLOCK_SCRIPT = (
-    "import runpy, time; own, ahead = time.monotonic, {} - time.monotonic(); time.monotonic = lambda: own() + ahead; "
-    "runpy.run_module('edgevpr', None, '__main__')"
+    "import runpy, time; clock, shift = time.monotonic, {} - time.monotonic(); "
+    "time.monotonic = lambda: clock() + shift; runpy.run_module('edgevpr', None, '__main__')"
 )
-_VELOCITY_MASK = 0b0000110111000111  # of SET_POSITION_TARGET_LOCAL_NED: position, acceleration and yaw do not count
+_VELOCITY_MASK = 0b0000110111000111  # of SET_POSITION_TARGET_LOCAL_NED: ignore position, acceleration and yaw
 
 
 class Run:
-    """A run of a scenario, with edgevpr or without, in the simulator of an `instance`: `fly` makes it, and returns the
-    folder of its files."""
+    """A run of a scenario in the simulator number `instance`, with edgevpr unless it `is_control`. `fly` makes the run
+    and returns the folder of its files."""
 
     def __init__(self, work: Path, folder: Path, scenario: Scenario, is_control: bool, instance: int = 0) -> None:
         self._work, self._scenario, self._is_control = work, scenario, is_control
@@ -54,7 +54,7 @@ class Run:
         self._corner = 0
 
     def fly(self) -> Path:
-        """Fly the scenario. Raises RuntimeError where that cannot be done."""
+        """Fly the scenario. Raises RuntimeError if the flight fails, for example if the autopilot does not arm."""
         with ExitStack() as stack:
             self._equip(stack)
             if self._scenario.starts_early:
@@ -69,34 +69,34 @@ class Run:
         return self._folder
 
     def _equip(self, stack: ExitStack) -> None:
-        """Start the simulator and the camera, lay the wire between them, and write edgevpr's configuration."""
+        """Start the simulator, the camera and the relay to the autopilot, and write edgevpr's configuration."""
         scenario, folder = self._scenario, self._folder
         home_m = scenario.home_m or (COPTER_HOME_M if scenario.vehicle == "copter" else HOME_M)
         parameters = {**({} if scenario.is_px4 else VEHICLE_PARAMETERS[scenario.vehicle]), **scenario.parameters}
         parameters |= {} if self._is_control else scenario.with_edgevpr
         listeners = [self._truth.handle_message, self._recorder.handle_message]
-        make = Px4 if scenario.is_px4 else Simulator
+        kind = Px4 if scenario.is_px4 else Simulator
         stack.callback(self._recorder.close)
-        simulator = make(scenario.vehicle, folder / "simulator", home_m, parameters, listeners, self._instance)
+        simulator = kind(scenario.vehicle, folder / "simulator", home_m, parameters, listeners, self._instance)
         self._simulator = stack.enter_context(simulator)
         if not self._is_control:
-            lit = ground.load_ground(self._work, "later")
+            lit_ground = ground.load_ground(self._work, "later")
             seed = ground.SEED + parse_flight_name(folder.name)[1]
-            self._camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, scenario))
+            self._camera = stack.enter_context(Camera(self._truth, lit_ground, folder / "pictures.csv", seed, scenario))
             self._relay = stack.enter_context(simulator.make_relay(self._truth, folder / "sent.csv", home_m))
             config = self._make_config(self._prepare_map(), self._camera.uri, self._relay.uri)
             (folder / "config.yaml").write_text(json.dumps(config, indent=1))  # JSON is YAML
         stack.callback(self._end_edgevpr)
 
     def _prepare_map(self) -> Path:
-        """Return the map of the ground, by the altitude of the simulator's."""
+        """Return the map of the ground, moved to the altitude of the simulator's ground."""
         scenario = self._scenario
         place_map = ground.build_place_map(self._work, scenario.height_m, scenario.mapped_m)
         up_m = GROUND_ALT_M - ground.GROUND_ALT_M if scenario.is_px4 else 0.0
         return ground.move_map(place_map, scenario.map_east_m, up_m)
 
     def _start_edgevpr(self, clock_s: float | None = None) -> None:
-        """Start edgevpr, unless it runs or is not to be in this flight; a `clock_s` is that of its computer."""
+        """Start edgevpr, unless it runs or this is a control; `clock_s` sets its monotonic clock (None: unchanged)."""
         if self._is_control or self._edgevpr:
             return
         module = ["-m", "edgevpr"]
@@ -122,8 +122,8 @@ class Run:
             "mavlink": {"link": link, "min_accuracy_m": 1.0},
             "log": {"path": str(self._folder / "flight.jsonl")},
         }
-        for room, keys in self._scenario.config.items():
-            config[room] = {**config.get(room, {}), **keys}
+        for section, keys in self._scenario.config.items():
+            config[section] = {**config.get(section, {}), **keys}
         return config
 
     def _take_off(self) -> None:
@@ -155,14 +155,14 @@ class Run:
             simulator.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, scenario.source_set)
 
     def _watch(self, seconds: float) -> None:
-        """Let the flight go on for so long; a copter is steered meanwhile, and ends where it has landed."""
+        """Continue the flight for `seconds`, while steering a copter; return early once a copter has landed."""
         began_s = time.monotonic()
         while (now_s := time.monotonic()) < began_s + seconds:
             if self._scenario.vehicle == "copter" and (self._has_landed() if self._scenario.is_px4 else self._steer()):
                 return
             if self._scenario.glitch_m_s and "loss" in self._marks_s:
-                away_m = self._scenario.glitch_m_s * (now_s - self._marks_s["loss"])
-                self._simulator.displace_gps(away_m)
+                north_m = self._scenario.glitch_m_s * (now_s - self._marks_s["loss"])
+                self._simulator.displace_gps(north_m)
             time.sleep(LOOP_STEP_S)
 
     def _has_landed(self) -> bool:
@@ -170,17 +170,17 @@ class Run:
         return pose is not None and pose.height_m < 1.0
 
     def _steer(self) -> bool:
-        """Send a copter on towards the next corner as a pilot who sees it would, by velocity; tell whether it has
+        """Steer a copter by velocity towards the next corner, like a pilot who sees it. Return True if it has
         landed."""
         pose = self._truth.compute_pose(time.monotonic())
         if pose is None:
             return False
         east_m, north_m = COPTER_CIRCUIT_M[self._corner % len(COPTER_CIRCUIT_M)]
         east_m, north_m = east_m - pose.east_m, north_m - pose.north_m
-        away_m = max(math.hypot(east_m, north_m), 0.1)
-        if away_m < 3 * COPTER_SPEED_M_S:
+        distance_m = max(math.hypot(east_m, north_m), 0.1)
+        if distance_m < 3 * COPTER_SPEED_M_S:
             self._corner += 1
-        east, north = (COPTER_SPEED_M_S * offset_m / away_m for offset_m in (east_m, north_m))
+        east, north = (COPTER_SPEED_M_S * offset_m / distance_m for offset_m in (east_m, north_m))
         down = max(-2.0, min(2.0, 0.5 * (pose.height_m - self._scenario.height_m)))
         target = (0, 1, 1, mavlink.MAV_FRAME_LOCAL_NED, _VELOCITY_MASK, 0, 0, 0, north, east, down, 0, 0, 0, 0, 0)
         self._simulator.link.send(mavlink.MAVLink_set_position_target_local_ned_message(*target))

@@ -12,7 +12,7 @@ from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_
 
 GCS_ADDRESS = (255, 190)  # system, component
 AUTOPILOT_ADDRESS = (1, 1)
-# SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
+# SIM_STATE is the truth. A plane, whose main loop runs at 50 Hz, sends it no faster.
 STREAMS_HZ = {
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: 2,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
@@ -25,9 +25,9 @@ Condition = Callable[[Message], bool]
 
 
 class Link:
-    """Keeps the newest message of each name that the autopilot sent ("COMMAND_ACK 400" of a command, "HEARTBEAT of 197"
-    of another component) and its time of receipt; passes every message to the listeners, with its time. `connected` is
-    a socket; with `bytewise`, as in PX4, the bytes of a parameter are an integer."""
+    """A connection that keeps the newest message of each name in `last`, and its time of receipt in `received_s`, and
+    passes every message to the listeners with its time. Names have the command, as in "COMMAND_ACK 400", or a component
+    other than the autopilot, as in "HEARTBEAT of 197". `bytewise`: integer parameters are sent as bytes, as in PX4."""
 
     def __init__(self, connected: socket.socket, listeners: list[Listener], bytewise: bool = False) -> None:
         self.last: dict[str, Message] = {}
@@ -47,7 +47,7 @@ class Link:
         self._socket.close()
 
     def write(self, data: bytes) -> None:
-        """Send bytes, as pymavlink asks for it; an autopilot that is gone hears nothing."""
+        """Send bytes, as a file for pymavlink; does nothing if the autopilot has disconnected."""
         with contextlib.suppress(OSError):
             self._socket.sendall(data)
 
@@ -59,7 +59,7 @@ class Link:
         self, name: str, condition: Condition, timeout_s: float, since_s: float | None = None
     ) -> Message | None:
         """Return the first message of a name, received after `since_s` (None: now), that fulfils a condition; None if
-        there is none in time."""
+        there is none within `timeout_s`."""
         since_s = time.monotonic() if since_s is None else since_s
         while time.monotonic() - since_s < timeout_s:
             if self.received_s.get(name, 0.0) >= since_s and condition(self.last[name]):
@@ -68,50 +68,50 @@ class Link:
         return None
 
     def command(self, number: int, *values: float) -> int | None:
-        """Send a COMMAND_LONG; return the result of its COMMAND_ACK, None where none comes."""
-        seven = [*values, *[0.0] * (7 - len(values))]
-        asked_s = time.monotonic()
-        self.send(mavlink.MAVLink_command_long_message(*AUTOPILOT_ADDRESS, number, 0, *seven))
-        answer = self.wait_for(f"COMMAND_ACK {number}", lambda _: True, 4.0, asked_s)
+        """Send a COMMAND_LONG; return the result of its COMMAND_ACK, None if there is none in time."""
+        parameters = [*values, *[0.0] * (7 - len(values))]
+        sent_s = time.monotonic()
+        self.send(mavlink.MAVLink_command_long_message(*AUTOPILOT_ADDRESS, number, 0, *parameters))
+        answer = self.wait_for(f"COMMAND_ACK {number}", lambda _: True, 4.0, sent_s)
         return answer and answer.result
 
     def send_parameter(self, name: str, value: float) -> None:
-        """Set a parameter, and do not wait: one that has changed by next to nothing is not answered."""
+        """Set a parameter without waiting: the autopilot does not answer if the value has hardly changed."""
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         if self._bytewise and isinstance(value, int):
             kind, value = mavlink.MAV_PARAM_TYPE_INT32, struct.unpack("<f", struct.pack("<i", value))[0]
         self.send(mavlink.MAVLink_param_set_message(*AUTOPILOT_ADDRESS, name.encode(), float(value), kind))
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
+        """Set a parameter. Raises RuntimeError if the autopilot does not accept it."""
 
-        def is_taken(message: Message) -> bool:
+        def is_accepted(message: Message) -> bool:
             current = read_parameter_value(message, self._bytewise) if message.param_id == name else None
-            return current is not None and math.isclose(current, value, rel_tol=1e-5, abs_tol=1e-6)  # floats of 32 bits
+            return current is not None and math.isclose(current, value, rel_tol=1e-5, abs_tol=1e-6)  # 32-bit floats
 
         for _ in range(4):
             self.send_parameter(name, value)
-            if self.wait_for("PARAM_VALUE", is_taken, 1.5):
+            if self.wait_for("PARAM_VALUE", is_accepted, 1.5):
                 return
-        raise RuntimeError(f"the autopilot does not take {name} {value}")
+        raise RuntimeError(f"the autopilot does not accept {name} {value}")
 
     def upload_mission(self, items: list[Message]) -> None:
-        """Upload a mission. Raises RuntimeError where the autopilot does not take it."""
-        asked_s = time.monotonic()
+        """Upload a mission. Raises RuntimeError if the autopilot does not accept it."""
+        began_s = time.monotonic()
         self.send(mavlink.MAVLink_mission_count_message(*AUTOPILOT_ADDRESS, len(items)))
-        sent_of_s: dict[str, float] = {}
-        while time.monotonic() - asked_s < 20:
+        answered_s: dict[str, float] = {}
+        while time.monotonic() - began_s < 20:
             for name in ("MISSION_REQUEST_INT", "MISSION_REQUEST"):
-                came_s = self.received_s.get(name, 0.0)
-                if came_s > sent_of_s.get(name, asked_s):
-                    sent_of_s[name] = came_s
+                request_s = self.received_s.get(name, 0.0)
+                if request_s > answered_s.get(name, began_s):
+                    answered_s[name] = request_s
                     self.send(items[self.last[name].seq])
-            if self.received_s.get("MISSION_ACK", 0.0) >= asked_s:
+            if self.received_s.get("MISSION_ACK", 0.0) >= began_s:
                 if self.last["MISSION_ACK"].type == mavlink.MAV_MISSION_ACCEPTED:
                     return
                 break
             time.sleep(0.005)
-        raise RuntimeError("the autopilot does not take the mission")
+        raise RuntimeError("the autopilot does not accept the mission")
 
     def _receive(self) -> None:
         receiver = PacketReader()
@@ -119,12 +119,12 @@ class Link:
         while self._is_open:
             try:
                 data = self._socket.recv(65536)
-            except (TimeoutError, ConnectionRefusedError):  # refused: datagrams to one that is still to start
+            except (TimeoutError, ConnectionRefusedError):  # refused: a datagram, before the autopilot has started
                 continue
             except OSError:
                 data = b""
             if not data:
-                return  # the autopilot is gone; who needs it finds that nothing comes
+                return  # the autopilot has disconnected; callers time out
             now_s = time.monotonic()
             for message in receiver.feed(data):
                 name, sender = message.get_type(), message.get_srcComponent()
@@ -133,7 +133,7 @@ class Link:
                 elif name == "COMMAND_ACK":
                     name = f"{name} {message.command}"
                 self.last[name] = message
-                self.received_s[name] = now_s  # written last: who sees the time finds the message
+                self.received_s[name] = now_s  # set last, so that readers of the time find the message
                 for listener in self._listeners:
                     listener(message, now_s)
 
@@ -145,7 +145,7 @@ class Link:
 
 
 def connect(port: int) -> socket.socket:
-    """Return a connection to a port of this machine. Raises RuntimeError where nobody answers there."""
+    """Return a TCP connection to a port of this machine. Raises RuntimeError if none is accepted within 30 s."""
     give_up_s = time.monotonic() + 30
     while True:
         try:

@@ -1,11 +1,11 @@
-"""The sweep: set-ups and events, each flown with edgevpr and beside its control, by a real ArduPilot and a real PX4 in
-their own simulators. `make never-worse` flies all that is not kept yet, and writes benchmarks/results/never-worse.md.
+"""The sweep: set-ups and events, each flown with edgevpr and compared with a control, by a real ArduPilot and a real
+PX4 in their simulators. `make never-worse` flies all that has no result yet and writes results/never-worse.md.
 
 python benchmarks/rig/never_worse.py [--quick | --cells CELL ...] [--workers N] [--report]
 
-The edgevpr that flies is that of the checkout EDGEVPR_CHECKOUT (this one). Rows are kept in
-~/.cache/edgevpr-rig/never_worse, those with edgevpr by its commit: an interrupted sweep goes on, and controls without
-edgevpr are flown once. Cells that are named are flown anew.
+The code of edgevpr is that of the checkout EDGEVPR_CHECKOUT (default: this one). Results are kept in
+~/.cache/edgevpr-rig/never_worse, those with edgevpr by its commit: an interrupted sweep continues, and controls without
+edgevpr are flown only once. With --cells, these cells are flown again.
 """
 
 import argparse
@@ -32,17 +32,17 @@ from trial import Trial
 from verdicts import compute_flight_figures, format_page, judge_cells
 
 KEPT_FOLDER = WORK / "never_worse"
-_FIRST_INSTANCE = 1  # of a simulator: the first ports are left to rig.py
+_FIRST_INSTANCE = 1  # of a simulator: instance 0 and its ports are left to rig.py
 
 
 def main() -> None:
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that what was started ends
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # exits normally, so that child processes end
     parser = argparse.ArgumentParser(description=__doc__.partition(":")[0])
-    parser.add_argument("--quick", action="store_true", help="the part of ten minutes before a release")
-    parser.add_argument("--cells", nargs="+", metavar="CELL", help="these, anew")
+    parser.add_argument("--quick", action="store_true", help="fly only the part of ten minutes for a release")
+    parser.add_argument("--cells", nargs="+", metavar="CELL", help="fly only these cells, even if they have results")
     parser.add_argument("--list", action="store_true", help="print the names of the cells")
-    parser.add_argument("--report", action="store_true", help="write the page of what is kept")
-    parser.add_argument("--workers", type=int, default=2, help="flights side by side (2)")
+    parser.add_argument("--report", action="store_true", help="fly nothing; write the page from the kept results")
+    parser.add_argument("--workers", type=int, default=2, help="flights at the same time (default: 2)")
     parser.add_argument("--flight", nargs=3, help=argparse.SUPPRESS)  # set-up, event, matches
     arguments = parser.parse_args()
     if arguments.flight:
@@ -52,7 +52,7 @@ def main() -> None:
         print("\n".join(CELLS))
         return
     if unknown := set(arguments.cells or ()) - set(CELLS):
-        parser.error(f"no cell {', '.join(sorted(unknown))}: --list names them")
+        parser.error(f"unknown cells: {', '.join(sorted(unknown))} (--list prints all names)")
     names = arguments.cells or [name for name, cell in CELLS.items() if cell.is_quick or not arguments.quick]
     if not arguments.report:
         require_simulators(names)
@@ -68,39 +68,39 @@ def main() -> None:
 
 
 def require_simulators(names: list[str]) -> None:
-    """End with a sentence where a simulator that these cells need is not built."""
+    """Exit with a message if a simulator that these cells need is not built."""
     set_ups = [SET_UPS[CELLS[name].flight.set_up] for name in names]
     if any(set_up.is_px4 for set_up in set_ups) and px4.find_build() is None:
-        sys.exit(f"never_worse: build PX4's simulator, and name its folder in {px4.VARIABLE}.")
+        sys.exit(f"never_worse: build PX4's simulator and set {px4.VARIABLE} to its folder.")
     if any(simulator.find_build(set_up.vehicle) is None for set_up in set_ups if not set_up.is_px4):
-        sys.exit(f"never_worse: build ArduPilot's simulator, and name its folder in {simulator.VARIABLE}.")
+        sys.exit(f"never_worse: build ArduPilot's simulator and set {simulator.VARIABLE} to its folder.")
 
 
 def find_row_path(flight: Flight) -> Path:
-    """Return the file of the figures of a flight."""
-    part = base.read_program_commit(ground.CHECKOUT).replace(" ", "-") if flight.has_edgevpr else "alone"
-    return KEPT_FOLDER / part / f"{flight.name}.json"
+    """Return the path of the figures of a flight."""
+    subfolder = base.read_program_commit(ground.CHECKOUT).replace(" ", "-") if flight.has_edgevpr else "alone"
+    return KEPT_FOLDER / subfolder / f"{flight.name}.json"
 
 
 def read_kept_rows() -> dict[str, base.Row]:
-    """Return the figures that are kept, by the name of the flight."""
+    """Return the kept figures by the name of the flight."""
     flights = {flight.name: flight for cell in CELLS.values() for flight in (cell.flight, cell.control)}
     paths = {name: find_row_path(flight) for name, flight in flights.items()}
     return {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}
 
 
-def fly_cells(names: list[str], anew: set[str], workers: int) -> None:
-    """Make the flights of these cells, and their controls, that are not kept, so many side by side."""
+def fly_cells(names: list[str], again: set[str], workers: int) -> None:
+    """Fly these cells and their controls, `workers` at a time, but those with results only if in `again`."""
     flights = {flight.name: flight for name in names for flight in (CELLS[name].control, CELLS[name].flight)}
-    due = [flight for name, flight in flights.items() if name in anew or not find_row_path(flight).exists()]
-    for mapped_m in {flight.make_scenario().mapped_m for flight in due}:  # made once, not by two flights at once
+    due = [flight for name, flight in flights.items() if name in again or not find_row_path(flight).exists()]
+    for mapped_m in {flight.make_scenario().mapped_m for flight in due}:  # not by two flights at once
         ground.build_place_map(WORK, 100.0, mapped_m)
 
     def fly_one(flight: Flight) -> None:
-        words = (flight.set_up, flight.event, flight.matches)
-        ended = subprocess.run([sys.executable, __file__, "--flight", *words], check=False)
-        if ended.returncode:
-            print(f"never_worse: {flight.name} has ended with {ended.returncode}", file=sys.stderr, flush=True)
+        arguments = (flight.set_up, flight.event, flight.matches)
+        process = subprocess.run([sys.executable, __file__, "--flight", *arguments], check=False)
+        if process.returncode:
+            print(f"never_worse: {flight.name} exited with code {process.returncode}", file=sys.stderr, flush=True)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(fly_one, due))
@@ -108,7 +108,7 @@ def fly_cells(names: list[str], anew: set[str], workers: int) -> None:
 
 @contextmanager
 def reserve_instance() -> Iterator[int]:
-    """Take a number of a simulator that no other sweep on this machine has; it is free again after the block."""
+    """Reserve, within the block, the number of a simulator instance that no other sweep on this machine uses."""
     KEPT_FOLDER.mkdir(parents=True, exist_ok=True)
     for number in count(_FIRST_INSTANCE):
         with open(KEPT_FOLDER / f"instance-{number}.lock", "w") as lock:
@@ -121,7 +121,7 @@ def reserve_instance() -> Iterator[int]:
 
 
 def fly_and_keep(flight: Flight) -> None:
-    """Make one flight, and keep its figures; a control that another sweep is flying is waited for."""
+    """Make one flight and write its figures. If another process flies the same control, wait for its result."""
     path = find_row_path(flight)
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path.with_suffix(".lock"), "w") as lock, reserve_instance() as instance:

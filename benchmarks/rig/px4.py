@@ -1,4 +1,4 @@
-"""PX4's own simulator (SIH) as a process, with the interface of ArduPilot's."""
+"""PX4's own simulator (SIH) as a process, with the same interface as that of ArduPilot in simulator.py."""
 
 import os
 import socket
@@ -14,11 +14,11 @@ from truth import Truth
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_PX4"
-# Of the first instance, 1 more for each next one: where PX4 listens for us; where it sends to and listens for edgevpr.
+# Ports of instance 0; each next instance adds 1. PX4 listens for the rig; it sends to edgevpr, and listens to it.
 _GCS_PORT = 18570
 _COMPANION_PORTS = (14540, 14580)
-GROUND_ALT_M = 1.0  # of the simulated ground: a plane's height control begins at an altitude of 0 and ramps from there
-# What an aircraft of the simulator needs to fly a mission that nobody holds a transmitter for, and that ends nowhere.
+GROUND_ALT_M = 1.0  # of the simulated ground: a plane's height control starts at an altitude of 0 and ramps from there
+# Parameters for an endless mission without a transmitter.
 PARAMETERS = {
     "COM_RCL_EXCEPT": 15,
     "NAV_RCL_ACT": 0,
@@ -28,11 +28,11 @@ PARAMETERS = {
     "SIM_BAT_DRAIN": 0,
     "SDLOG_MODE": -1,
 }
-# The airframe of 1.18 sets the thrust by a name that its simulator no longer reads: at 2 N it never leaves the ground.
+# The airframe of 1.18 sets its thrust by a parameter that the simulator no longer reads; with 2 N it cannot take off.
 _VEHICLE_PARAMETERS = {"plane": {"SIH_F_T_MAX": 6.0, "SIH_F_Q_MAX": 0.03}, "copter": {}}
 _MODELS = {"plane": "sihsim_airplane", "copter": "sihsim_quadx"}
 _AUTO_MODE = 4
-_MISSION_MODE = 4  # of AUTO
+_MISSION_MODE = 4  # sub-mode of AUTO
 MODES = {f"AUTO.{name}": _AUTO_MODE << 16 | number << 24 for name, number in (("MISSION", 4), ("RTL", 5), ("LAND", 6))}
 MODES |= {"AUTO.LOITER": _AUTO_MODE << 16 | 3 << 24, "DESCEND": 4 << 16 | 10 << 24}
 _STREAMS_HZ = {
@@ -45,14 +45,14 @@ _CIRCUIT_M = ((340.0, 730.0), (1060.0, 730.0), (1060.0, 260.0), (340.0, 260.0))
 
 
 def find_build() -> Path | None:
-    """Return the folder of the PX4 build that EDGEVPR_PX4 names, None where none is there."""
+    """Return the folder of the PX4 build in EDGEVPR_PX4, or None if it has no build."""
     folder = Path(os.environ.get(VARIABLE, ""))
     return folder.resolve() if (folder / "bin/px4").exists() else None
 
 
 class Px4(Process):
-    """A PX4 that starts with the `with` block and ends with it; `home_m` is where it stands, metres east and north.
-    Those of other `instance` numbers run beside it."""
+    """A PX4 that runs within the `with` block, from `home_m` (metres east and north). Several can run at the same time
+    with different `instance` numbers."""
 
     ground_alt_m = GROUND_ALT_M
 
@@ -78,17 +78,17 @@ class Px4(Process):
         build = find_build()
         command = [build / "bin/px4", "-i", self._instance, "-d", build / "etc", "-w", self._folder]
         self._launch(command, self._environment)
-        station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        station.connect(("127.0.0.1", _GCS_PORT + self._instance))
-        self._connect(Link(station, self._listeners, bytewise=True), _STREAMS_HZ)
+        gcs_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        gcs_socket.connect(("127.0.0.1", _GCS_PORT + self._instance))
+        self._connect(Link(gcs_socket, self._listeners, bytewise=True), _STREAMS_HZ)
 
     def make_relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> DatagramRelay:
-        """Make the wire to edgevpr."""
+        """Return the relay between this PX4 and edgevpr."""
         return DatagramRelay(truth, log, tuple(port + self._instance for port in _COMPANION_PORTS), origin_m)
 
     def take_off(self, height_m: float, items: list[Message] | None = None) -> None:
-        """Start a mission (None: round and round a circuit), and wait until the aircraft is at that height. Raises
-        RuntimeError where it never is."""
+        """Start a mission (None: endless laps of a circuit) and wait until the aircraft is at `height_m`. Raises
+        RuntimeError if it does not arm or does not reach the height."""
         self.wait_ready()
         self.link.upload_mission(items or _make_mission(self._vehicle, height_m))
         flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -100,7 +100,7 @@ class Px4(Process):
         else:
             raise RuntimeError("PX4 does not arm")
         if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 950 * height_m, 180):
-            raise RuntimeError(f"{height_m:.0f} m are not reached")
+            raise RuntimeError(f"the aircraft did not reach {height_m:.0f} m")
 
     def set_gps(self, is_on: bool) -> None:
         self.set_satellites(10 if is_on else 0)
@@ -109,12 +109,12 @@ class Px4(Process):
         self.link.set_parameter("SIM_GPS_USED", count)
 
     def displace_gps(self, north_m: float) -> None:
-        """Let the receiver's positions lie so far north of the truth. README.md says what this takes."""
+        """Displace the receiver's positions to the north. Needs a parameter that README.md describes."""
         self.link.send_parameter("SIM_GPS_OFF_N", float(north_m))
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
         if from_deg != 270.0:
-            raise ValueError("the wind blows from the west")
+            raise ValueError("PX4's simulator is only used with wind from the west")
         self.link.set_parameter("SIH_WIND_E", float(speed_m_s))
 
     def wait_ready(self) -> None:
@@ -126,20 +126,20 @@ class Px4(Process):
                 if is_placed and status.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK:
                     return
             time.sleep(0.1)
-        raise RuntimeError("PX4 is never ready")
+        raise RuntimeError("PX4 was not ready within 120 s")
 
 
 def _make_mission(vehicle: str, height_m: float) -> list[Message]:
-    """Make the mission: take off, then round and round the corners of a circuit, (east, north) each."""
+    """Return the items of a mission: take-off, then endless laps of a circuit."""
     takeoff, waypoint, jump = mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_DO_JUMP
-    free = (0, 0, 0, float("nan"))
+    no_values = (0, 0, 0, float("nan"))
     if vehicle == "plane":
-        rows = [(takeoff, free, (HOME_M[0], HOME_M[1] + 320), 0.6 * height_m)]
-        rows += [(waypoint, free, corner_m, height_m) for corner_m in _CIRCUIT_M]
+        rows = [(takeoff, no_values, (HOME_M[0], HOME_M[1] + 320), 0.6 * height_m)]
+        rows += [(waypoint, no_values, corner_m, height_m) for corner_m in _CIRCUIT_M]
         rows += [(jump, (1, -1, 0, 0), None, 0)]
     else:
-        rows = [(takeoff, free, COPTER_HOME_M, height_m)]
+        rows = [(takeoff, no_values, COPTER_HOME_M, height_m)]
         rows += [(mavlink.MAV_CMD_DO_CHANGE_SPEED, (1, COPTER_SPEED_M_S, -1, 0), None, 0)]
-        rows += [(waypoint, free, corner_m, height_m) for corner_m in COPTER_CIRCUIT_M]
+        rows += [(waypoint, no_values, corner_m, height_m) for corner_m in COPTER_CIRCUIT_M]
         rows += [(jump, (2, -1, 0, 0), None, 0)]
     return make_mission_items(rows)

@@ -1,4 +1,4 @@
-"""What happened, ten times a second: where the aircraft was, and where its autopilot took itself to be."""
+"""Records the true and the estimated position of the aircraft, ten times a second, and all text messages."""
 
 import math
 import threading
@@ -9,13 +9,13 @@ from truth import Truth
 from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.mavlink.wire import Message, mavlink
 
-EDGEVPR = 197  # its component id
+EDGEVPR = 197  # MAVLink component id of edgevpr
 COLUMNS = ("t_s", "east_m", "north_m", "est_east_m", "est_north_m", "error_m", "mode", "height_m")
 
 
 class Recorder:
-    """Writes a line for every GLOBAL_POSITION_INT while it `is_on`, and keeps the texts: time, component, text.
-    `warnings` are those of edgevpr that a ground station shows as such."""
+    """Writes a row for every GLOBAL_POSITION_INT while it `is_on`, and keeps all `texts` as (time, component, text).
+    `warnings` are texts of edgevpr with severity WARNING or worse."""
 
     def __init__(self, truth: Truth, path: Path) -> None:
         self._truth, self._lock = truth, threading.Lock()
@@ -32,7 +32,7 @@ class Recorder:
             self._file.close()
 
     def handle_message(self, message: Message, now_s: float) -> None:
-        """Take note of a message."""
+        """Record a message of the link."""
         name, sender = message.get_type(), message.get_srcComponent()
         if name == "STATUSTEXT":
             self.texts.append((now_s, sender, message.text))

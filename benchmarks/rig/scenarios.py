@@ -1,4 +1,4 @@
-"""The table of the scenarios: who flies, what is taken away, and what edgevpr is told to do about it."""
+"""The table of scenarios: the vehicle, what fails in flight, and the configuration of edgevpr."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 from edgevpr.frames.level import STRAIGHT_DOWN, Mount
 
 HEIGHT_M = 100.0
-# Metres east and north on the ground.
+# Positions on the ground, metres east and north.
 HOME_M = (240.0, 200.0)
 CLIMB_M = (560.0, 230.0)
 CIRCUIT_M = ((1060.0, 260.0), (1060.0, 730.0), (340.0, 730.0), (340.0, 260.0))
@@ -21,14 +21,14 @@ WIND_FROM_DEG = 270.0
 class Scenario:
     """A flight: `gps_s` seconds with GPS, then `off_s` without.
 
-    From the loss on there is wind, and the autopilot is told to use the `source_set` (None: its own choice). Without
-    `loses_gps` the receiver stays; it moves away by `glitch_m_s` from then on, or a PX4 `uses_no_gps`. The camera
-    `is_level` on a gimbal, or fixed to the airframe with a `mount` that edgevpr is not told, and its pictures are
-    `is_stamped` with their times, or not. `parameters` are the autopilot's, `with_edgevpr` those that are set for a
-    flight with edgevpr only; `config` is what edgevpr's configuration says beside the usual; its map ends `mapped_m`
-    north (None: nowhere), where the ground comes to lie so many times (`beyond_scale`) farther below, and all of
-    it lies `map_east_m` off; `is_blind`: the camera sees nothing known. The vehicle stands at `home_m` (None: the
-    usual). `starts_early`: edgevpr runs before arming. `is_compared`: the flight without edgevpr says something."""
+    The wind begins with the loss of GPS; then the autopilot also switches to `source_set` (None: it chooses itself). If
+    not `loses_gps`, the receiver works on, displaced by `glitch_m_s` per second, or PX4 ignores it (`uses_no_gps`). The
+    camera `is_level` on a gimbal, or fixed to the airframe with a `mount` that edgevpr does not know; `is_stamped`: its
+    pictures have time stamps. `parameters` are set on the autopilot, those of `with_edgevpr` not in the control;
+    `config` are further keys of edgevpr's configuration. The map ends at `mapped_m` north (None: it does not end), from
+    where the ground is `beyond_scale` times as far below, and is displaced by `map_east_m`. `is_blind`: the camera
+    shows nothing that is in the map. `home_m`: start of the vehicle (None: the usual one). `starts_early`: edgevpr runs
+    before arming. `is_compared`: the flight is also made without edgevpr."""
 
     vehicle: str = "plane"
     is_px4: bool = False
@@ -56,12 +56,12 @@ class Scenario:
 
 
 def format_flight_name(name: str, seed: int) -> str:
-    """Return the name of a scenario's flight of a seed: "plane_wind", "plane_wind.2"."""
+    """Return the name of the flight of a scenario with a seed, such as "plane_wind" or "plane_wind.2"."""
     return name if seed == 1 else f"{name}.{seed}"
 
 
 def parse_flight_name(flight: str) -> tuple[str, int]:
-    """Return the name of the scenario of a flight, and its seed; the inverse of `format_flight_name`."""
+    """Return the scenario name and the seed of a flight's name; the inverse of `format_flight_name`."""
     name, _, seed = flight.partition(".")
     return name, int(seed or 1)
 
@@ -71,14 +71,14 @@ VEHICLE_PARAMETERS = {
         "ROLL_LIMIT_DEG": 35,
         "WP_LOITER_RAD": 70,
         "TERRAIN_ENABLE": 0,
-        "THR_FAILSAFE": 0,  # nobody holds a transmitter
+        "THR_FAILSAFE": 0,  # there is no transmitter
         "FS_SHORT_ACTN": 3,
         "FS_LONG_ACTN": 0,
     },
     "copter": {"FS_THR_ENABLE": 0, "FS_GCS_ENABLE": 0},
 }
 
-_FLOW = {  # a flow sensor and a range finder that reaches the ground, as the second set of sources
+_FLOW = {  # an optical-flow sensor and a range finder with enough range, as the second source set
     "FLOW_TYPE": 10,
     "SIM_FLOW_ENABLE": 1,
     "RNGFND1_TYPE": 100,
@@ -100,7 +100,7 @@ ODOMETRY = {
     "EK3_SRC2_YAW": 1,
 }
 
-AGP = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}  # PX4: positions of message 296
+AGP = {"EKF2_AGP0_CTRL": 1, "EKF2_AGP0_ID": 1, "EKF2_AGP0_DELAY": 0.0}  # PX4: uses message 296 (GLOBAL_POSITION_SENSOR)
 
 SCENARIOS = {
     "plane_wind": Scenario(wind_m_s=6.0),
@@ -119,7 +119,7 @@ SCENARIOS = {
     "plane_clean": Scenario(loses_gps=False, off_s=1800.0, is_compared=False),
     "px4_copter": Scenario(is_px4=True, vehicle="copter", with_edgevpr=AGP),
     "px4_plane": Scenario(is_px4=True, wind_m_s=6.0, with_edgevpr=AGP),
-    "px4_plane_still": Scenario(is_px4=True, is_compared=False),  # by 43003; the simulator of 1.17.0 has no wind
+    "px4_plane_still": Scenario(is_px4=True, is_compared=False),  # command 43003; the simulator of 1.17.0 has no wind
     "px4_copter_unused": Scenario(
         is_px4=True,
         vehicle="copter",

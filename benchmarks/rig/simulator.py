@@ -1,4 +1,4 @@
-"""ArduPilot's simulator as a process of its own, and what a scenario asks of it."""
+"""ArduPilot's simulator as a process, with the actions that scenarios need."""
 
 import contextlib
 import os
@@ -20,12 +20,12 @@ from edgevpr.lab.simulate.generated import to_position
 from edgevpr.mavlink.wire import Message, mavlink
 
 VARIABLE = "EDGEVPR_ARDUPILOT"
-_PORTS = 5760, 5762, 5763  # the rig's, edgevpr's, and one that is left open; those of the next instance are 10 higher
+_PORTS = 5760, 5762, 5763  # for the rig, for edgevpr, and unused; each next instance adds 10
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A vehicle of ArduPilot: its binary, the model of its physics, its default parameters and numbers of its modes."""
+    """A vehicle of ArduPilot: binary, model of its physics, file of default parameters, and numbers of its modes."""
 
     binary: str
     model: str
@@ -43,20 +43,19 @@ VEHICLES = {
 
 
 def find_build(vehicle: str = "plane") -> Path | None:
-    """Return the folder of ArduPilot that EDGEVPR_ARDUPILOT names, None where that vehicle has not been built there."""
+    """Return the ArduPilot folder in EDGEVPR_ARDUPILOT, or None if that vehicle is not built there."""
     folder = Path(os.environ.get(VARIABLE, ""))
     return folder.resolve() if (folder / "build/sitl/bin" / VEHICLES[vehicle].binary).exists() else None
 
 
 def to_degrees(east_m: float, north_m: float) -> tuple[float, float]:
-    """Return latitude and longitude of a point of the ground."""
+    """Return latitude and longitude of a position on the ground, metres east and north."""
     position = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
     return position.lat_deg, position.lon_deg
 
 
 class Process:
-    """The process of a simulator, in a folder of its own, and the rig's link to it: from the begin of the `with` block
-    to its end. `listeners` hear every message."""
+    """A simulator process in its own folder, within the `with` block; `listeners` receive every message of its link."""
 
     def __init__(self, folder: Path, listeners: list[Listener]) -> None:
         self._folder, self._listeners = folder, listeners
@@ -76,7 +75,7 @@ class Process:
         self.kill()
 
     def start(self, *, wipe: bool) -> None:
-        """Start the process, with the parameters of old unless they are wiped, and connect to it."""
+        """Start the process and connect to it; with `wipe`, without the parameters saved by earlier starts."""
         raise NotImplementedError
 
     def _launch(self, command: list, environment: dict[str, str]) -> None:
@@ -87,15 +86,15 @@ class Process:
             )
 
     def _connect(self, link: Link, streams_hz: dict[int, float]) -> None:
-        """Keep the link, and ask for messages at these rates."""
+        """Store the link, and request messages at these rates (by message id)."""
         self.link = link
         if not self.link.wait_for("HEARTBEAT", lambda _: True, 30):
-            raise RuntimeError(f"the simulator says nothing: see {self._folder}/simulator.txt")
+            raise RuntimeError(f"no heartbeat from the simulator: see {self._folder}/simulator.txt")
         for number, rate_hz in streams_hz.items():
             self.link.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
 
     def kill(self) -> None:
-        """End the process as a loss of power does."""
+        """Kill the process, as a loss of power would."""
         if self.link:
             self.link.close()
         if self._process:
@@ -106,8 +105,8 @@ class Process:
 
 
 class Simulator(Process):
-    """ArduPilot's simulator; `home_m` is where it stands, metres east and north. Those of other `instance` numbers run
-    beside it."""
+    """ArduPilot's simulator; the vehicle starts at `home_m`, metres east and north. Several can run at the same time
+    with different `instance` numbers."""
 
     ground_alt_m = GROUND_ALT_M
 
@@ -131,7 +130,7 @@ class Simulator(Process):
         try:
             socket.create_server(("", self._ports[2])).close()
         except OSError:
-            raise RuntimeError("another simulator runs on this machine: end it first") from None
+            raise RuntimeError("another simulator runs on this machine; stop it first") from None
         return super().__enter__()
 
     def start(self, *, wipe: bool) -> None:
@@ -146,11 +145,11 @@ class Simulator(Process):
         self._connect(Link(connect(self._ports[0]), self._listeners), STREAMS_HZ)
 
     def make_relay(self, truth: Truth, log: Path, origin_m: tuple[float, float]) -> Relay:
-        """Make the wire to edgevpr."""
+        """Return the relay between this autopilot and edgevpr."""
         return Relay(truth, log, self._ports[1], origin_m)
 
     def wait_ready(self) -> None:
-        """Wait until the autopilot knows where it is and would arm. Raises RuntimeError where that takes minutes."""
+        """Wait until the autopilot has a position and is ready to arm. Raises RuntimeError after three minutes."""
         attitude_and_position = mavlink.EKF_ATTITUDE | mavlink.EKF_POS_HORIZ_ABS
         give_up_s = time.monotonic() + 180
         while time.monotonic() < give_up_s:
@@ -160,10 +159,10 @@ class Simulator(Process):
                 if health & mavlink.MAV_SYS_STATUS_PREARM_CHECK and not ekf.flags & mavlink.EKF_UNINITIALIZED:
                     return
             time.sleep(0.1)
-        raise RuntimeError("the autopilot is never ready")
+        raise RuntimeError("the autopilot was not ready within 180 s")
 
     def arm(self, mode: str) -> None:
-        """Change the mode and arm. Raises RuntimeError where the autopilot refuses."""
+        """Set the mode and arm. Raises RuntimeError if the autopilot refuses to arm."""
         self.set_mode(mode)
         for _ in range(20):
             if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
@@ -176,9 +175,9 @@ class Simulator(Process):
         self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
 
     def wait_height(self, height_m: float) -> None:
-        """Wait until the aircraft is that high. Raises RuntimeError where it does not climb."""
+        """Wait until the aircraft is at `height_m`. Raises RuntimeError after three minutes."""
         if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 1000 * height_m, 180):
-            raise RuntimeError(f"{height_m:.0f} m are not reached")
+            raise RuntimeError(f"the aircraft did not reach {height_m:.0f} m")
 
     def set_gps(self, is_on: bool) -> None:
         self.link.set_parameter("SIM_GPS1_ENABLE", int(is_on))
@@ -187,7 +186,7 @@ class Simulator(Process):
         self.link.set_parameter("SIM_GPS1_NUMSATS", count)
 
     def displace_gps(self, north_m: float) -> None:
-        """Let the receiver's positions lie so far north of the truth."""
+        """Displace the receiver's positions to the north of the truth."""
         north_deg = to_degrees(0.0, north_m)[0] - to_degrees(0.0, 0.0)[0]
         self.link.send_parameter("SIM_GPS1_GLTCH_X", north_deg)
 
@@ -197,16 +196,16 @@ class Simulator(Process):
 
 
 def make_mission(height_m: float) -> list[Message]:
-    """Make the mission of a plane: take off, then round and round the corners of a circuit, (east, north) each."""
+    """Return the items of a plane's mission: take-off, then endless laps of a circuit."""
     takeoff, waypoint, jump = mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_DO_JUMP
-    free = (0, 0, 0, 0)
-    rows = [(waypoint, free, HOME_M, 0.0), (takeoff, (12, 0, 0, 0), CLIMB_M, 0.6 * height_m)]
-    rows += [(waypoint, free, corner_m, height_m) for corner_m in CIRCUIT_M]
+    no_values = (0, 0, 0, 0)
+    rows = [(waypoint, no_values, HOME_M, 0.0), (takeoff, (12, 0, 0, 0), CLIMB_M, 0.6 * height_m)]
+    rows += [(waypoint, no_values, corner_m, height_m) for corner_m in CIRCUIT_M]
     return make_mission_items([*rows, (jump, (2, -1, 0, 0), None, 0)])
 
 
 def make_mission_items(rows) -> list[Message]:
-    """Make the items of a mission from (command, its four values, place or None, height) each."""
+    """Return mission items, of rows (command, its first four values, (east, north) or None, height in metres)."""
     items = []
     for number, (command, values, at_m, up_m) in enumerate(rows):
         lat, lon = (round(1e7 * degrees) for degrees in to_degrees(*at_m)) if at_m else (0, 0)

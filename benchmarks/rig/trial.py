@@ -1,4 +1,4 @@
-"""One flight of the sweep: the aircraft hovers, circles or flies a leg, and what the table says happens to it."""
+"""One flight of the sweep: the aircraft hovers, circles or flies a leg while the steps of an event are carried out."""
 
 import json
 import math
@@ -21,16 +21,16 @@ from edgevpr.mavlink.wire import mavlink
 
 _SETTLE_S = 10.0
 _POWER_OFF_S = 6.0
-_PARAMETER_REQUESTS_S = 10.0  # after which edgevpr has asked for all parameters
-_PARAMETER_SAVE_S = 3.0  # after which a parameter that was set outlives a loss of power
-_CIRCLE_ENTRY_S = 40.0  # until a plane is on its circle, at the most
-_CIRCLE_POINTS = 72  # of a circle
-_PAUSE_REQUEST = 1  # edgevpr's wish, first parameter of MAV_CMD_USER_1
+_PARAMETER_REQUESTS_S = 10.0  # edgevpr has requested all parameters by then
+_PARAMETER_SAVE_S = 3.0  # a parameter is stored by then and survives a loss of power
+_CIRCLE_ENTRY_S = 40.0  # longest time until a plane is on its circle
+_CIRCLE_POINTS = 72  # corners of the planned path
+_PAUSE_REQUEST = 1  # first parameter of MAV_CMD_USER_1, as edgevpr defines it
 
 
 class Trial(Run):
-    """A flight of the table. The actions of its steps are methods; those of edgevpr and of its wire do nothing in a
-    flight without edgevpr."""
+    """A flight of the table. The actions of steps are methods; those that need edgevpr or its relay are skipped in a
+    control flight without edgevpr."""
 
     def __init__(self, work: Path, folder: Path, flight: Flight, instance: int) -> None:
         super().__init__(work, folder, flight.make_scenario(), not flight.has_edgevpr, instance)
@@ -38,8 +38,8 @@ class Trial(Run):
         self._repeated_actions: dict[str, Callable[[float], object]] = {}
 
     def fly(self) -> Path:
-        """Fly it. What cannot be flown is said in run.json."""
-        cannot = None
+        """Make the flight and return its folder. If it fails, run.json has the reason as `cannot`."""
+        failure = None
         with ExitStack() as stack:
             try:
                 self._equip(stack)
@@ -51,21 +51,21 @@ class Trial(Run):
                 self._simulator.wait_ready()
                 self._take_off()
                 self._wait_settled()
-                self._watch(WATCH_S)
-                self._wait_pose()  # a simulator that has not lasted until here has flown nothing
+                self._run_event(WATCH_S)
+                self._wait_pose()  # raises if the simulator has ended early
             except RuntimeError as error:
-                cannot = str(error)
+                failure = str(error)
             self._recorder.is_on = False
         run = {
             "commit": base.read_program_commit(ground.CHECKOUT),
-            "cannot": cannot,
+            "cannot": failure,
             "marks_s": self._marks_s,
             "path_m": getattr(self, "_path_m", None),
             "texts": self._recorder.texts,
             "warnings": self._recorder.warnings,
         }
         (self._folder / "run.json").write_text(json.dumps(run))
-        shutil.rmtree(self._folder / "simulator", ignore_errors=True)  # the autopilot's own logs are large
+        shutil.rmtree(self._folder / "simulator", ignore_errors=True)  # its logs are large
         return self._folder
 
     def _take_off(self) -> None:
@@ -89,7 +89,7 @@ class Trial(Run):
             simulator.wait_height(HEIGHT_M - 1.0)
 
     def _wait_settled(self) -> None:
-        """Wait until the aircraft is where it is to be watched, and note the path that it should keep to."""
+        """Wait until the aircraft hovers or is on its circle, and store the path that it should follow."""
         give_up_s = time.monotonic() + _CIRCLE_ENTRY_S
         is_plane = self._scenario.vehicle == "plane"
         while is_plane and time.monotonic() < give_up_s and abs(self._measure_radius_m() - RADIUS_M) > 40.0:
@@ -97,9 +97,9 @@ class Trial(Run):
         time.sleep(_SETTLE_S)
         if is_plane:
             radius_m = self._measure_radius_m()
-            turns = [2 * math.pi * number / _CIRCLE_POINTS for number in range(_CIRCLE_POINTS + 1)]
+            angles = [2 * math.pi * number / _CIRCLE_POINTS for number in range(_CIRCLE_POINTS + 1)]
             self._path_m = [
-                (CENTRE_M[0] + radius_m * math.cos(turn), CENTRE_M[1] + radius_m * math.sin(turn)) for turn in turns
+                (CENTRE_M[0] + radius_m * math.cos(angle), CENTRE_M[1] + radius_m * math.sin(angle)) for angle in angles
             ]
         else:
             pose = self._wait_pose()
@@ -117,7 +117,8 @@ class Trial(Run):
         pose = self._wait_pose()
         return math.hypot(pose.east_m - CENTRE_M[0], pose.north_m - CENTRE_M[1])
 
-    def _watch(self, seconds: float) -> None:
+    def _run_event(self, seconds: float) -> None:
+        """Carry out the steps of the event when they are due, for `seconds`."""
         began_s = self._marks_s["event"] = time.monotonic()
         if self._event.leaves_map and self._scenario.vehicle == "copter":
             self._go_to(LEG_M[1])
@@ -126,23 +127,23 @@ class Trial(Run):
             while steps and now_s >= began_s + steps[0].at_s:
                 step = steps.pop(0)
                 self._run_action(step.action, step.values)
-            for act in list(self._repeated_actions.values()):
-                act(now_s)
+            for action in list(self._repeated_actions.values()):
+                action(now_s)
             time.sleep(LOOP_STEP_S)
 
     def _go_to(self, at_m: tuple[float, float]) -> None:
         lat, lon = (round(1e7 * degrees) for degrees in to_degrees(*at_m))
         values = (0, 0, -1, 1, RADIUS_M if self._scenario.vehicle == "plane" else 0, math.nan, lat, lon)
         up_m, frame = HEIGHT_M, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
-        if self._scenario.is_px4:  # which knows this command by altitude only
+        if self._scenario.is_px4:  # PX4 only accepts an altitude in this command
             up_m, frame = self._simulator.link.last["GLOBAL_POSITION_INT"].alt / 1e3, mavlink.MAV_FRAME_GLOBAL
         command = mavlink.MAV_CMD_DO_REPOSITION
         self._simulator.link.send(mavlink.MAVLink_command_int_message(1, 1, frame, command, *values, up_m))
 
     def _await_edgevpr(self) -> None:
-        """Wait until edgevpr has begun, and has had the time to ask for parameters."""
+        """Wait until edgevpr has started and has had time to request parameters."""
         if not self._is_control and not self._simulator.link.wait_for(f"HEARTBEAT of {EDGEVPR}", lambda _: True, 60):
-            raise RuntimeError("edgevpr does not begin")
+            raise RuntimeError("edgevpr did not start within 60 s")
         time.sleep(_PARAMETER_REQUESTS_S)
 
     def _run_action(self, action: str, values: tuple[float, ...]) -> None:
@@ -150,7 +151,7 @@ class Trial(Run):
         if action not in _EDGEVPR_ACTIONS or not self._is_control:
             getattr(self, action)(*values)
 
-    # What happens to the autopilot and its receiver
+    # Actions on the autopilot and its receiver
 
     def set_gps(self, is_on: float) -> None:
         self._simulator.set_gps(bool(is_on))
@@ -175,54 +176,54 @@ class Trial(Run):
         self._simulator.link.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, number)
 
     def set_home(self, up_m: float) -> None:
-        """Set the home so far above the ground on which it was."""
-        place = *to_degrees(*self._scenario.home_m), self._simulator.ground_alt_m + up_m
-        self._simulator.link.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, *place)
+        """Set the home position to `up_m` above the ground at its old position."""
+        position = *to_degrees(*self._scenario.home_m), self._simulator.ground_alt_m + up_m
+        self._simulator.link.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, *position)
 
     def set_origin(self, east_m: float, up_m: float) -> None:
-        """Set the origin of the local frame so far east of the place where it stood, and above it."""
-        east_from, north_from = self._scenario.home_m
-        lat, lon = (round(1e7 * degrees) for degrees in to_degrees(east_from + east_m, north_from))
+        """Set the origin of the local frame to `east_m` east of the start and `up_m` above the ground."""
+        home_east_m, home_north_m = self._scenario.home_m
+        lat, lon = (round(1e7 * degrees) for degrees in to_degrees(home_east_m + east_m, home_north_m))
         alt_mm = round(1000 * (self._simulator.ground_alt_m + up_m))
         self._simulator.link.send(mavlink.MAVLink_set_gps_global_origin_message(1, lat, lon, alt_mm))
 
     def reboot(self) -> None:
-        """Take the autopilot's power away and give it back; it keeps its parameters."""
+        """Switch the autopilot off and on again; it keeps its parameters."""
         self._await_edgevpr()
         self._simulator.kill()
         time.sleep(_POWER_OFF_S)
         self._simulator.start(wipe=False)
 
-    # What happens to edgevpr and to its wire
+    # Actions on edgevpr and its relay
 
     def adopt(self) -> None:
-        """Give the autopilot the parameters of the set-up, as edgevpr's doctor advises."""
+        """Set the parameters of the set-up on the autopilot, as `edgevpr doctor` advises."""
         self._await_edgevpr()
         for name, value in SET_UPS[self._flight.set_up].parameters.items():
             self._simulator.link.set_parameter(name, value)
         time.sleep(_PARAMETER_SAVE_S)
 
     def lose_requests(self, seconds: float) -> None:
-        """Let no request for a parameter reach the autopilot until so long after the first."""
-        asked_s: list[float] = []
+        """Lose all parameter requests from the first one until `seconds` later."""
+        requests_s: list[float] = []
 
         def is_lost(message) -> bool:
             if message.get_type() != "PARAM_REQUEST_READ":
                 return False
-            asked_s.append(time.monotonic())
-            return asked_s[-1] < asked_s[0] + seconds
+            requests_s.append(time.monotonic())
+            return requests_s[-1] < requests_s[0] + seconds
 
         self._relay.drops = is_lost
 
     def restart_edgevpr(self, clock_s: float | None = None) -> None:
-        """Kill edgevpr and start it again, with a computer whose clock begins anew (None: it goes on)."""
+        """Kill and start edgevpr, with its monotonic clock set to `clock_s` as after a reboot (None: unchanged)."""
         self._edgevpr.kill()
         self._edgevpr.wait()
         self._edgevpr = None
         self._start_edgevpr(clock_s)
 
     def stop_edgevpr(self, seconds: float) -> None:
-        """Give edgevpr no processor for so long."""
+        """Stop the process of edgevpr for `seconds`, as if the CPU were busy."""
         resume_s = time.monotonic() + seconds
         self._edgevpr.send_signal(signal.SIGSTOP)
 
@@ -237,23 +238,23 @@ class Trial(Run):
         self._camera.is_frozen = bool(is_frozen)
 
     def pause(self) -> None:
-        wish = (1, EDGEVPR, mavlink.MAV_CMD_USER_1, 0, _PAUSE_REQUEST, 0, 0, 0, 0, 0, 0)
-        self._simulator.link.send(mavlink.MAVLink_command_long_message(*wish))
+        request = (1, EDGEVPR, mavlink.MAV_CMD_USER_1, 0, _PAUSE_REQUEST, 0, 0, 0, 0, 0, 0)
+        self._simulator.link.send(mavlink.MAVLink_command_long_message(*request))
 
     def saturate(self, bytes_per_s: float) -> None:
         self._relay.saturate(bytes_per_s)
 
     def send_other_stamps(self) -> None:
-        """Let another program on the wire send stamps of the year."""
+        """Send messages of another program, whose time stamps are in UTC instead of time since boot."""
         packer = mavlink.MAVLink(None, 1, 198)
 
         def send(_now_s: float) -> None:
-            numbers = (round(time.time() * 1e6), 0, mavlink.MAV_FRAME_BODY_FRD, 0.1, 0.1, 20.0, 0.0, 0.0)
-            self._relay.inject(mavlink.MAVLink_landing_target_message(*numbers).pack(packer), to_edgevpr=True)
+            values = (round(time.time() * 1e6), 0, mavlink.MAV_FRAME_BODY_FRD, 0.1, 0.1, 20.0, 0.0, 0.0)
+            self._relay.inject(mavlink.MAVLink_landing_target_message(*values).pack(packer), to_edgevpr=True)
 
         self._repeated_actions["stamps"] = send
 
 
 _EDGEVPR_ACTIONS = frozenset(
     ("adopt", "lose_requests", "restart_edgevpr", "stop_edgevpr", "freeze", "pause", "saturate", "send_other_stamps")
-) | {"choose_sources"}  # the control has but one set
+) | {"choose_sources"}  # the control has only one source set

@@ -1,4 +1,4 @@
-"""The figures of a flight of the sweep, what is wrong with a cell, and the page of them all."""
+"""The figures of a flight of the sweep, the verdict on each cell, and the page of all cells."""
 
 import json
 import math
@@ -16,11 +16,11 @@ from recording import EDGEVPR
 
 from edgevpr.runtime.flight.flightlog import read_log
 
-# A flight with edgevpr may be worse than its control by no more.
+# Limits for how much worse than its control a flight with edgevpr may be.
 MARGIN_M = 3.0
 MARGIN_S = 5.0
-FIRST_POSITION_S = 60.0  # after an autopilot has started, which needs 25 s to find its place
-_GPS_ERROR_M = 5.0  # the estimate is on GPS again from when on it stays this near the truth
+FIRST_POSITION_S = 60.0  # after a start of the autopilot, which itself needs 25 s to get a position
+_GPS_ERROR_M = 5.0  # the estimate uses GPS again once its error stays below this
 _DISTANCES = {"strayed_m": "strays {:.0f} m", "sank_m": "sinks {:.0f} m", "error_m": "estimate {:.0f} m off"}
 _COLUMNS = {
     "cell": "{cell}",
@@ -39,14 +39,14 @@ _COLUMNS = {
 
 
 def compute_flight_figures(folder: Path, flight: Flight) -> Row:
-    """Return the figures of a flight, from its folder: of the watched time, the largest distances; and the texts."""
+    """Return the figures of a flight from its folder: maxima over the watched time, counts, and the texts."""
     run, event = json.loads((folder / "run.json").read_text()), EVENTS[flight.event]
     marks_s, track = run["marks_s"], read_table(folder / "track.csv")
     texts = [text.removeprefix("edgevpr: ") for _, sender, text in run["texts"] if sender == EDGEVPR]
     row: Row = {"commit": run["commit"], "cannot": run["cannot"], "warnings": run["warnings"], "texts": texts}
-    if run["cannot"]:  # all counts from when on the autopilot had found its place
-        found_s = track["t_s"][(track["error_m"] < _GPS_ERROR_M) & (track["t_s"] >= marks_s.get("started", math.inf))]
-        began_s = float(found_s[0]) if len(found_s) else math.inf
+    if run["cannot"]:  # figures start when the autopilot has a position
+        placed_s = track["t_s"][(track["error_m"] < _GPS_ERROR_M) & (track["t_s"] >= marks_s.get("started", math.inf))]
+        began_s = float(placed_s[0]) if len(placed_s) else math.inf
         row["error_m"] = float(track["error_m"][track["t_s"] >= began_s].max(initial=0.0))
     else:
         began_s = marks_s["event"]
@@ -71,32 +71,32 @@ def compute_flight_figures(folder: Path, flight: Flight) -> Row:
 
 
 def _count_accepted(folder: Path) -> str:
-    """Return how many queries were accepted, of how many: a restart begins another log."""
+    """Return the text "accepted of all" queries, from all logs: a restart begins a new log."""
     queries = [line for log in folder.glob("flight*.jsonl") for line in read_log(log) if line["kind"] == "query"]
     return f"{sum(query['accepted'] for query in queries)} of {len(queries)}"
 
 
 def compute_distances(points_m: np.ndarray, path_m: list) -> np.ndarray:
-    """Return the distance of each point (N, 2) from a path, a list of corners."""
+    """Return the distance (N,) of each point (N, 2) from a path, a list of corners."""
     corners = np.array(path_m, float)
     distances_m = np.full(len(points_m), math.inf)
     for start, end in pairwise(corners):
-        along = end - start
-        share = np.clip((points_m - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)
-        distances_m = np.minimum(distances_m, np.hypot(*(points_m - start - share[:, None] * along).T))
+        leg = end - start
+        share = np.clip((points_m - start) @ leg / max(float(leg @ leg), 1e-9), 0.0, 1.0)
+        distances_m = np.minimum(distances_m, np.hypot(*(points_m - start - share[:, None] * leg).T))
     return distances_m
 
 
 def measure_recovery_s(after_s: np.ndarray, error_m: np.ndarray) -> float | None:
-    """Return after how many seconds the error is small for good; None where it is not at the end."""
-    far = np.flatnonzero((error_m > _GPS_ERROR_M) & (after_s >= 0))
-    if len(far) == 0:
+    """Return the time from which the error stays below `_GPS_ERROR_M`; None if it is larger at the end."""
+    large = np.flatnonzero((error_m > _GPS_ERROR_M) & (after_s >= 0))
+    if len(large) == 0:
         return 0.0
-    return None if far[-1] == len(after_s) - 1 else round(float(after_s[far[-1] + 1]), 1)
+    return None if large[-1] == len(after_s) - 1 else round(float(after_s[large[-1] + 1]), 1)
 
 
 def find_faults(figures: Row, control: Row) -> list[str]:
-    """Return what is wrong with a flight, by the figures and those of its control."""
+    """Return the faults of a flight as texts, from its figures and those of its control."""
     if control["cannot"]:
         return [f"no control: {control['cannot']}"]
     faults = [figures["cannot"]] if figures["cannot"] and not is_refused(figures) else []
@@ -117,50 +117,50 @@ def find_faults(figures: Row, control: Row) -> list[str]:
 
 
 def is_refused(figures: Row) -> bool:
-    """Tell whether edgevpr sent nothing in the watched time, or the aircraft stayed on the ground, and it has warned: a
-    busy computer is a notice."""
+    """Return True if edgevpr has warned, and has sent nothing in the watched time or the aircraft stayed on the ground.
+    The message on a busy computer is a notice, not a warning."""
     return bool(figures["warnings"]) and (not figures.get("sent") or bool(figures["cannot"]))
 
 
 def judge_cells(rows: Mapping[str, Row]) -> list[Row]:
-    """Return a row for each cell of the table that was flown beside its control, by the figures of flights by name."""
+    """Judge each cell of the table that was flown, as was its control. `rows`: figures of each flight, by its name."""
     judged = []
     for name, cell in CELLS.items():
         figures, control = rows.get(name), rows.get(cell.control.name)
         if figures and control:
-            wrong = find_faults(figures, control)
-            verdict = "; ".join(wrong) or ("refused" if is_refused(figures) else "right")
-            fields = {"cell": name, "beside": cell.control.name, "verdict": verdict, "is_right": not wrong}
+            faults = find_faults(figures, control)
+            verdict = "; ".join(faults) or ("refused" if is_refused(figures) else "right")
+            fields = {"cell": name, "beside": cell.control.name, "verdict": verdict, "is_right": not faults}
             judged.append({**fields, "with": figures, "control": control})
     return judged
 
 
 def format_page(result: Row) -> str:
-    """Return the page for people."""
+    """Return the results as Markdown."""
     cells = result["cells"]
     wrong = [row for row in cells if not row["is_right"]]
     texts = "\n".join(f"* {row['cell']}: {'; '.join(row['with']['texts']) or 'none'}" for row in cells)
-    other = [f"{row['cell']} (by {row['beside']})" for row in cells if CELLS[row["cell"]].control.has_edgevpr]
+    with_edgevpr = [f"{row['cell']} (by {row['beside']})" for row in cells if CELLS[row["cell"]].control.has_edgevpr]
     commits = Counter(row["with"]["commit"] for row in cells)
     versions = ", ".join(f"{commit} ({count} cells)" for commit, count in commits.items())
     return f"""# Never worse than alone
 
-A real ArduPilot or PX4 in its own simulator, with edgevpr, and the same flight without it: {len(cells)} of {len(CELLS)}
-cells of the table (benchmarks/rig/cells.py: set-up, event, and what the camera recognises) are flown, {len(wrong)} are
-worse. A copter hovers 100 m high or flies a leg, a plane circles; then comes the event, and {WATCH_S:.0f} s are
-watched.
+A real ArduPilot or PX4 in its own simulator flies with edgevpr, and makes the same flight without it: {len(cells)} of
+{len(CELLS)} cells of the table (benchmarks/rig/cells.py: set-up, event, and the matches of the camera) are flown, and
+{len(wrong)} are worse. A copter hovers at 100 m or flies a leg, a plane circles; then the event begins, and
+{WATCH_S:.0f} s are watched.
 
-Metres, the largest of that time: how far the aircraft strays from where it should fly, how far it sinks, and how far
-its autopilot's estimate is from the truth; beside each the same of the control. Seconds from the moment at which GPS is
-as before until the estimate stays within {_GPS_ERROR_M:.0f} m. Positions sent; queries accepted in all of the flight.
+Largest values of that time in metres, each followed by that of the control (alone): distance of the aircraft from its
+planned path, loss of height, and error of the autopilot's estimate. Then the seconds from the return of GPS until this
+error stays within {_GPS_ERROR_M:.0f} m, the number of positions sent, and the queries accepted in the whole flight.
 
-Right: nothing is more than {MARGIN_M:.0f} m worse than the control, GPS is used again {MARGIN_S:.0f} s later than by it
-at the latest, after a start of the autopilot positions come within {FIRST_POSITION_S:.0f} s, and none while paused.
-Refused: edgevpr sends nothing, or the aircraft does not arm, and it has warned.
+Right: compared with the control, no distance is more than {MARGIN_M:.0f} m worse, and GPS is used again at most
+{MARGIN_S:.0f} s later; positions come within {FIRST_POSITION_S:.0f} s of a start of the autopilot, none while paused.
+Refused: edgevpr has warned, and it sends nothing or the aircraft does not arm.
 
 {base.format_table(cells, _COLUMNS)}
 
-Where edgevpr is needed, the control has it too and lacks a part of the event: {", ".join(other) or "none"}.
+Cells whose control also flies with edgevpr, but without a part of the event: {", ".join(with_edgevpr) or "none"}.
 
 What edgevpr reported to the ground station:
 

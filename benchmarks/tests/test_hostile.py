@@ -1,4 +1,4 @@
-"""Short runs of `hostile.py`: what a hostile world may not bring about does not come about."""
+"""Short runs of `hostile.py`: damaged maps and hostile pictures cause no traceback and no wrong position."""
 
 import base
 import hostile_maps
@@ -6,10 +6,10 @@ import hostile_pictures
 import pytest
 import walks
 
-needs_sets = pytest.mark.skipif(not base.DATA.is_dir(), reason="the image sets of ../shared/data are not there")
-# Views ahead that were accepted as places of maps made looking down, when only score and margin were asked.
-AHEAD = [f"nordland_tiny/query/{number}.png" for number in ("0216", "0222", "0291", "0324", "0330")]
-AHEAD += ["grief_stromovka_seasons/query/0055.jpg", "grief_stromovka_seasons/ref/0035.jpg"]
+needs_sets = pytest.mark.skipif(not base.DATA.is_dir(), reason="the image sets of ../shared/data are missing")
+# Forward pictures that nadir maps accepted when acceptance depended only on score and margin.
+FORWARD_PICTURES = [f"nordland_tiny/query/{number}.png" for number in ("0216", "0222", "0291", "0324", "0330")]
+FORWARD_PICTURES += ["grief_stromovka_seasons/query/0055.jpg", "grief_stromovka_seasons/ref/0035.jpg"]
 
 
 def test_run_damaged_maps_reports_no_traceback_no_wrong_position_and_no_lost_place():
@@ -24,7 +24,7 @@ def test_map_of_downward_images_refuses_forward_images(tmp_path):
     folder = base.DATA / "aerial_brighton"
     recogniser = hostile_pictures.open_set_map(folder, tmp_path)
     with recogniser.place_map:
-        assert not any(recogniser.step(walks.make_frame(base.DATA / path)).accepted for path in AHEAD)
+        assert not any(recogniser.step(walks.make_frame(base.DATA / path)).accepted for path in FORWARD_PICTURES)
         assert recogniser.step(walks.make_frame(min((folder / "query").iterdir()))).accepted
 
 

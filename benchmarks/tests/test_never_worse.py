@@ -1,4 +1,4 @@
-"""The sweep of the rig: what needs no simulator."""
+"""Tests of the sweep of the rig that need no simulator."""
 
 import json
 import sys
@@ -65,12 +65,12 @@ def test_judge_cells_compares_each_with_its_control(changed, verdict):
 
 
 def test_compute_flight_figures_measures_flight_until_gps_is_back(tmp_path):
-    """A hover, of which the estimate and the aircraft run away together until GPS is back at 50 s."""
+    """A hover whose estimate and aircraft drift away together until GPS is back at 50 s."""
     columns = "t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode,height_m"
     lines = []
     for after_s in np.arange(-5, 130, 0.1):
-        off_m = min(max(after_s, 0), 40) if after_s < 60 else 0.0
-        lines.append(f"{1000 + after_s:.1f},{600 + off_m},450,600,450,{off_m:.2f},4,{100 - off_m / 10:.2f}")
+        drift_m = min(max(after_s, 0), 40) if after_s < 60 else 0.0
+        lines.append(f"{1000 + after_s:.1f},{600 + drift_m},450,600,450,{drift_m:.2f},4,{100 - drift_m / 10:.2f}")
     (tmp_path / "track.csv").write_text("\n".join([columns, *lines]) + "\n")
     (tmp_path / "sent.csv").write_text(
         "t_s,kind,age_s,east_m,north_m,accuracy_m,true_east_m,true_north_m\n"

@@ -1,4 +1,4 @@
-"""Every script can be loaded, every page is what its results say, and so is what travels with edgevpr."""
+"""Tests that every script loads, and that pages and shipped files match the results they are made from."""
 
 import importlib
 import json

@@ -1,4 +1,4 @@
-"""The rig: what needs no simulator."""
+"""Tests of the rig that need no simulator."""
 
 import json
 import sys
@@ -22,8 +22,8 @@ def to_degrees(east_m: float, north_m: float) -> tuple[float, float]:
 
 
 def test_compute_pose_extrapolates_a_turn_after_two_states():
-    """Banked by 30 degrees, the nose turns at g tan(30) / v: 14.7 degrees a second at 22 m/s."""
-    roll, turn = np.radians(30.0), 9.81 * np.tan(np.radians(30.0)) / 22.0
+    """Banked by 30 degrees, an aircraft turns at g tan(30) / v: 14.7 degrees per second at 22 m/s."""
+    roll, turn_rate = np.radians(30.0), 9.81 * np.tan(np.radians(30.0)) / 22.0
     lat_deg, lon_deg = to_degrees(500.0, 300.0)
     state = SimpleNamespace(
         get_type=lambda: "SIM_STATE",
@@ -34,8 +34,8 @@ def test_compute_pose_extrapolates_a_turn_after_two_states():
         pitch=0.0,
         yaw=np.radians(350.0),
         xgyro=0.0,
-        ygyro=turn * np.sin(roll),
-        zgyro=turn * np.cos(roll),
+        ygyro=turn_rate * np.sin(roll),
+        zgyro=turn_rate * np.cos(roll),
         ve=0.0,
         vn=22.0,
         vd=1.0,
@@ -44,14 +44,14 @@ def test_compute_pose_extrapolates_a_turn_after_two_states():
     states.handle_message(state, 10.0)
     pose = states.compute_pose(10.1)
     assert (pose.east_m, pose.north_m, pose.height_m) == pytest.approx((500.0, 302.2, 99.9), abs=0.02)
-    heading_deg = 350.0 + np.degrees(turn) / 10
+    heading_deg = 350.0 + np.degrees(turn_rate) / 10
     assert (pose.roll_deg, pose.pitch_deg, pose.heading_deg) == pytest.approx((30.0, 0.0, heading_deg))
-    assert states.compute_pose(9.9) is None  # nothing is known of before
-    assert states.compute_pose(10.5) is None  # nor of so long after
+    assert states.compute_pose(9.9) is None  # before the first state
+    assert states.compute_pose(10.5) is None  # too long after the last state
 
 
 def test_compute_run_figures_measures_run_after_gps_loss(tmp_path):
-    """GPS is lost at 100 s; the estimate drifts at 2 m/s for ten seconds, and the pictures were taken at the truth."""
+    """GPS is lost at 100 s; the estimate drifts at 2 m/s for ten seconds, and the aircraft does not move."""
     columns = "t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode"
     lines = [f"{t:.1f},500,300,500,300,{2 * max(t - 100, 0):.2f},10" for t in np.arange(95, 110.05, 0.1)]
     (tmp_path / "track.csv").write_text("\n".join([columns, *lines]) + "\n")
@@ -63,7 +63,7 @@ def test_compute_run_figures_measures_run_after_gps_loss(tmp_path):
         "99,COMMAND_INT,0.1,999,300,1,500,300\n"
         "104.1,COMMAND_INT,0.1,503,300,2,500,300\n106.1,COMMAND_INT,0.1,501,300,2,500,300\n"
     )
-    located = [(104, 503.0), (106, 501.0)]
+    fixes = [(104, 503.0), (106, 501.0)]
     log = [
         {
             "kind": "query",
@@ -74,7 +74,7 @@ def test_compute_run_figures_measures_run_after_gps_loss(tmp_path):
             "accuracy_m": 2.0,
             "located": dict(zip(("lat_deg", "lon_deg"), to_degrees(east, 300.0), strict=True)),
         }
-        for t, east in located
+        for t, east in fixes
     ]
     log.append({"kind": "gps", "t_mono_s": 107.0, "is_wrong": True})
     log.append({"kind": "end", "mavlink": {"acks": {"ACCEPTED": 2}}})

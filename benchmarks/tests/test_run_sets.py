@@ -1,4 +1,4 @@
-"""`make results` on a folder with one small set."""
+"""Tests of `make results` on a folder with small sets."""
 
 import cv2
 import pytest
@@ -26,8 +26,8 @@ def make_set(folder, places=4):
 
 def test_measure_writes_one_file_per_set_and_its_summary_lines(tmp_path):
     make_set(tmp_path / "data" / "meadow")
-    make_set(tmp_path / "data" / "grief_stromovka_monthly", places=1)  # one of those that are left out
-    for variants in ("hog;cohog", "seqslam"):  # the second adds to what the first has written
+    make_set(tmp_path / "data" / "grief_stromovka_monthly", places=1)  # a set that is left out
+    for variants in ("hog;cohog", "seqslam"):  # the second run adds to the file of the first
         measure(tmp_path / "data", tmp_path / "out", "--variants", variants)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["curves.png", "meadow.json", "sets.md"]
 
@@ -50,7 +50,7 @@ def test_measure_places_site_sets_and_measures_known_headings(tmp_path):
     rows = [f"{side}{n}.png,{'ab'[n // 2]},1,{240 * n},90,0" for side in ("query", "ref") for n in range(4)]
     (tmp_path / "data" / "sat_town" / "sites.csv").write_text("\n".join(["file,site,time,x_px,y_px,yaw_deg", *rows]))
     measure(tmp_path / "data", tmp_path / "out", "--variants", "cohog, known")
-    assert not (tmp_path / "out" / "meadow.json").exists(), "it has no headings"
+    assert not (tmp_path / "out" / "meadow.json").exists(), "the set has no headings"
     (content,) = sets_page.read_sets(tmp_path / "out")
     row = content["techniques"]["cohog, known"]
     assert (row["known"], row["parameters"]["camera"]) == ("heading,height", "nadir")
