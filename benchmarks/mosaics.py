@@ -87,7 +87,7 @@ def fit_ground(folder: Path, layout: MosaicLayout) -> Ground:
     tags = {name: tag.position for name, tag in read_positions(folder / "positions.csv").items() if tag.position}
     tagged = [name for name in layout.middle if name in tags]
     lat_deg, lon_deg = ([getattr(tags[name], key) for name in tagged] for key in ("lat_deg", "lon_deg"))
-    crs = f"EPSG:{32600 + int((np.mean(lon_deg) + 180) // 6) + 1}"  # UTM of the northern half
+    crs = f"EPSG:{32600 + int((np.mean(lon_deg) + 180) // 6) + 1}"  # UTM zone, northern hemisphere
     east_m, north_m = transform("EPSG:4326", crs, lon_deg, lat_deg)
     pixels = np.array([complex(*layout.middle[name] * (1, -1)) for name in tagged])
     scale, offset = _fit_similarity(pixels, np.array(east_m) + 1j * np.array(north_m))

@@ -80,10 +80,10 @@ VARIANTS = (
 
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=base.DATA)
-    parser.add_argument("--sets", metavar="A,B", help="names of sets, comma-separated (default: all)")
-    parser.add_argument("--variants", metavar="A;B", help="rows of the tables, separated by semicolons (default: all)")
-    parser.add_argument("--out", type=Path, default=base.RESULTS)
+    parser.add_argument("--data", type=Path, default=base.DATA, help="folder of the image sets")
+    parser.add_argument("--sets", metavar="A,B", help="measure these sets, separated by commas (default: all)")
+    parser.add_argument("--variants", metavar="A;B", help="measure these rows, separated by semicolons (default: all)")
+    parser.add_argument("--out", type=Path, default=base.RESULTS, help="folder of the result files")
     args = parser.parse_args(argv)
     folders = base.find_sets(args.data, args.sets.split(",") if args.sets else None)
     variants = find_variants(args.variants.split(";") if args.variants else None)

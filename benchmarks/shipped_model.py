@@ -64,6 +64,7 @@ def fit_shipped_model(kind: str, sites: Sequence[SiteEvidence], made_of: str) ->
 
 
 def _fit_regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:
+    """Fit a logistic regression on the named figures of evidence, with equal weight for each group (right or wrong)."""
     groups = [(rows, right) for rows, right in groups if len(rows)]
     rows = [row.figures() for group, _ in groups for row in group]
     right = np.concatenate([np.full(len(group), is_right) for group, is_right in groups])

@@ -76,14 +76,14 @@ map: a query in 10 000 places takes {query["two_stage_ms"]:.0f} ms, including en
 def format_pcu(results: Results) -> str:
     """Return the section on figure 6.6: PCU by table 6.1, by the author's matrices, and by the results here."""
     table = THESIS["table_6_1"]
-    here = values.compute_pcu(select_rows(results, "corridor"))
+    project = values.compute_pcu(select_rows(results, "corridor"))
     seasons = values.compute_pcu(select_rows(results, "grief_stromovka_seasons"))
     published = values.compute_pcu(results.thesis["matrices"])
     rows = []
     for name in (*table["techniques"], "cohog, as it flies"):
         printed = compute_table_pcu(name) if name in table["techniques"] else [None] * len(table["sets"])
         theirs = published.get(MATRICES.get(name, ""))
-        ours = here.get(name)
+        ours = project.get(name)
         difference = None if theirs is None or ours is None else ours - theirs
         cells = map(_format_number, (*printed, theirs, ours))
         rows.append([name, *cells, _format_number(difference, "+.2f"), _format_number(seasons.get(name))])

@@ -10,11 +10,11 @@ from thesis_values import ROWS, THESIS, Results, total_ah
 
 def list_results(results: Results) -> list[list[str]]:
     """Return a row for each table and figure that can be reproduced: its name, how, the result, and the section."""
-    matrices, here = results.thesis["matrices"], results.sets["corridor"]["techniques"]
+    matrices, techniques = results.thesis["matrices"], results.sets["corridor"]["techniques"]
     power = THESIS["table_5_2"]["techniques"]
     max_error = max(abs(total_ah(*map(float, inputs)) / float(ah) - 1) for *inputs, ah in power.values())
-    calc = here[ROWS["CALC"]]["auc_2_3"] - matrices["CALC"]["auc_2_3"]
-    cohog = here[ROWS["CoHOG"]]["recall_at_1"] - matrices["CoHOG"]["recall_at_1"]
+    calc = techniques[ROWS["CALC"]]["auc_2_3"] - matrices["CALC"]["auc_2_3"]
+    cohog = techniques[ROWS["CoHOG"]]["recall_at_1"] - matrices["CoHOG"]["recall_at_1"]
     leads = f"CoHOG best on {costs.count_sets_cohog_leads()} of {len(THESIS['table_6_1']['sets'])} sets, as stated"
     corridor = f"CALC's AUC {calc:+.3f}, CoHOG's recall@1 {cohog:+.3f}; networks lower, as they are small"
     smaller = f"CoHOG's map {costs.compute_map_ratio(results):.0f} times smaller in RAM"

@@ -60,13 +60,13 @@ def format_precision(results: Results) -> str:
     """Return the section that compares the precisions of table 6.1 with those on the available sets."""
     table = THESIS["table_6_1"]
     sets = ("corridor", *OTHER_SETS)
-    here = {name: select_rows(results, name) for name in sets}
+    ours = {name: select_rows(results, name) for name in sets}
     rows = []
     for name in (*ROWS, "cohog, as it flies"):
         values = table["techniques"].get(name, ())[: len(table["sets"])]
         printed = [float(value) for value in values if value is not None]
         spread = f"{min(printed):.2f} to {max(printed):.2f}" if printed else "-"
-        rows.append([name, spread, *(f"{here[set_name][name]['precision_at_100_recall']:.2f}" for set_name in sets)])
+        rows.append([name, spread, *(f"{ours[set_name][name]['precision_at_100_recall']:.2f}" for set_name in sets)])
     return f"""## Table 6.1 and figure 6.7: precision at 100 % recall
 
 {capitalise(table["source"])}. Its five sets ({", ".join(table["sets"])}) are not available: the first column has the

@@ -45,8 +45,7 @@ XEON_BOARD = "thesis-xeon"
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """The results that the page needs: of image sets (by name), of `make bench`, of the salience gate, and of
-    `make thesis`."""
+    """Results that the page needs: image sets by name, `make bench`, the salience gate, and `make thesis`."""
 
     sets: dict[str, dict[str, Any]]
     bench: dict[str, Any]
@@ -96,7 +95,7 @@ def total_ah(u_encode: float, u_match: float, t_encode_s: float, t_match_s: floa
 
 
 def compute_table_pcu(technique: str) -> list[float | None]:
-    """Return the PCU of a technique of table 6.1 on each of its sets: the bars of figure 6.6."""
+    """Return the PCU of a technique on each set of table 6.1 (the bars of figure 6.6; None: no value)."""
     table = THESIS["table_6_1"]
     *precisions, t_encode_s, _ = table["techniques"][technique]
     slowest_s = float(table["slowest_s"])

@@ -77,6 +77,7 @@ def load_set(folder: Path) -> AerialSet:
 
 
 def _solve_pairs(folder: Path, names: list[str], tags: dict[str, complex]) -> GraphSolution:
+    """Solve the pose graph of the registered pairs that were not rejected, and of the GPS tags of all `names`."""
     slots = {name: slot for slot, name in enumerate(names)}
     rejected_path = folder / "rejected_pairs.csv"
     rejected_rows = base.read_csv(rejected_path) if rejected_path.is_file() else []
@@ -112,7 +113,7 @@ def measure_set(folder: Path, work: Path) -> tuple[Row, dict[str, Place], Aerial
         "set": folder.name,
         "use": base.find_use(folder.name),
         "spacing_m": float(np.median(abs(np.diff([site.tags[name] for name in places])))),
-        "errors": {truth: {key: summarise(off) for key, off in stages.items()} for truth, stages in errors.items()},
+        "errors": {truth: {key: summarise(group) for key, group in stages.items()} for truth, stages in errors.items()},
         "within": {
             truth: compute_sigma_shares(errors[truth]["after"], truth_variances, tag_var if truth == "GPS" else 0.0)
             for truth, truth_variances in variances.items()

@@ -39,8 +39,7 @@ class SetUp:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """An action of an event, `at_s` after the start of the watched time: `action` is the name of a method of `Trial`,
-    `values` are its arguments."""
+    """An action, `at_s` after the start of the watched time: the name of a method of `Trial` and its arguments."""
 
     at_s: float
     action: str

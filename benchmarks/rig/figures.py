@@ -80,6 +80,7 @@ def compare_estimates(with_edgevpr: np.ndarray, without: np.ndarray) -> tuple[fl
 
 
 def _score_estimate(track: np.ndarray, loss_s: float) -> Row:
+    """Return the errors of the autopilot's estimate after the loss: summary, and interpolated at AFTER_LOSS_S."""
     after_s, error_m = track["t_s"] - loss_s, track["error_m"]
     end_s = after_s[-1] + 0.5
     times_s = [time_s for time_s in AFTER_LOSS_S if time_s <= end_s]
@@ -124,8 +125,7 @@ def _score_claims(errors_m: np.ndarray, claimed_m: np.ndarray) -> Row:
 
 
 def _score_sent(sent: np.ndarray) -> Row:
-    """Return, by message name, the rate of sent positions and their errors relative to the true positions of their
-    times."""
+    """Return the rate, errors and claimed accuracies of sent positions, by the name of their message."""
     figures = {}
     for kind in np.unique(sent["kind"]):
         rows = sent[sent["kind"] == kind]

@@ -143,6 +143,7 @@ class Run:
         self._recorder.is_on = True
 
     def _remove_gps(self) -> None:
+        """Record the time of the loss, and apply all changes of the scenario at that time: GPS, wind, source set."""
         scenario, simulator = self._scenario, self._simulator
         self._marks_s["loss"] = time.monotonic()
         if scenario.loses_gps:
@@ -170,8 +171,7 @@ class Run:
         return pose is not None and pose.height_m < 1.0
 
     def _steer(self) -> bool:
-        """Steer a copter by velocity towards the next corner, like a pilot who sees it. Return True if it has
-        landed."""
+        """Steer a copter by velocity to the next corner, like a pilot who sees it; return True once it has landed."""
         pose = self._truth.compute_pose(time.monotonic())
         if pose is None:
             return False

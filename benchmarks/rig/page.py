@@ -60,8 +60,7 @@ _SENT = {
 
 
 def write_page(work: Path) -> None:
-    """Write rig.json, rig.md and the pictures from the newest run of each scenario. Figures of runs without a folder
-    stay as they are."""
+    """Write rig.json, rig.md and its pictures from the newest runs; keep the figures of runs without a folder."""
     names_flown = sorted(folder.name for folder in (work / "runs").iterdir() if "-" not in folder.name)
     new = {name: runs for name in names_flown if (runs := _compute_runs(work / "runs", name))}
     old, order = base.read("rig").get("scenarios", {}), [*SCENARIOS]

@@ -107,6 +107,7 @@ class Trial(Run):
             self._path_m = [start_m, LEG_M[1] if self._event.leaves_map else start_m]
 
     def _wait_pose(self):
+        """Return the true pose now. Raises RuntimeError if there is none for some seconds."""
         for _ in range(50):
             if pose := self._truth.compute_pose(time.monotonic()):
                 return pose
