@@ -11,7 +11,8 @@ without history, the result is that of the query alone. Three rules limit the in
 * Pictures of the same ground are not new evidence. A hypothesis stores the evidence already counted (`credited`) for
   the ground below it (`anchor`), and the next query there replaces it. In a hover only the newest query counts.
 * Ground outside the map that was mistaken for a place may also resemble the next places. So a place that fits the
-  history raises the odds of being on the map only by a limited factor.
+  history raises the odds of being on the map only by a limited factor, and a history predicts a place only if it
+  includes a match that was certain by itself (`confirmed`).
 """
 
 import math
@@ -19,7 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.core.arrays import Bools, Doubles, Ints
 from edgevpr.runtime.recognise.gaussians import (
     MIN_VARIANCE_RATIO,
     compute_distances,
@@ -75,7 +76,8 @@ class Motion:
 class _Hypotheses:
     """M possible positions of the aircraft: `weight` (M,), `position` (M, 2) with its `covariance` (M, 2, 2),
     `velocity` (M, 2) in map units per second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
-    unknown). `credited` (M,): logarithm of the likelihood ratio already counted around `anchor` (M, 2)."""
+    unknown). `credited` (M,): logarithm of the likelihood ratio already counted around `anchor` (M, 2). `confirmed`
+    (M,): the fraction (0..1) of the weight that descends from a match that was certain by itself."""
 
     weight: Doubles
     position: Doubles
@@ -84,6 +86,7 @@ class _Hypotheses:
     heading: Doubles
     credited: Doubles
     anchor: Doubles
+    confirmed: Doubles
 
     def __getitem__(self, index: Ints) -> "_Hypotheses":
         return _Hypotheses(**{name: getattr(self, name)[index] for name in self.__slots__})
@@ -119,18 +122,20 @@ class MapScale:
 class Proposals:
     """The K positions proposed by one query alone. `probability` (K,) is that of each; the remainder to 1 is that of
     none of them. Prior: the aircraft is off the map with probability 1/2, otherwise equally likely at any place.
-    `covariance` (K, 2, 2) is that of the `position` (K, 2). `heading_deg` (K,): NaN if unknown."""
+    `covariance` (K, 2, 2) is that of the `position` (K, 2). `heading_deg` (K,): NaN if unknown. `is_certain` (K,): the
+    query needs no history to accept a place at this position."""
 
     probability: Doubles
     position: Doubles
     covariance: Doubles
     heading_deg: Doubles
+    is_certain: Bools
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
     """Belief after a query: the probability of being `lost`, the `probability` (K,) of each candidate of the query,
-    the one `predicted` (K,) from the earlier queries, and an estimate of the `position` (2,), its `covariance` (2, 2),
+    the one `predicted` (K,) by confirmed hypotheses, and an estimate of the `position` (2,), its `covariance` (2, 2),
     and the heading (None: unknown). `mass` is the total probability of the hypotheses near it; without any, the
     estimate is NaN."""
 
@@ -150,7 +155,7 @@ class Belief:
         self._scale = scale
         self._strongest, self._lost, self._enter_chance = 0.0, 1.0, 0.5  # as in the prior of the proposals
         shapes = {"weight": 0, "position": (0, 2), "covariance": (0, 2, 2), "velocity": (0, 2), "heading": (0, 2)}
-        shapes |= {"credited": 0, "anchor": (0, 2)}
+        shapes |= {"credited": 0, "anchor": (0, 2), "confirmed": 0}
         self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
     def drop_off_map(self, places: Doubles, sight: float) -> None:
@@ -183,7 +188,9 @@ class Belief:
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
             misses = _predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
-            predicted[indices] = self._compute_mass_near(replace(misses, weight=now.weight), proposed.position)
+            predicted[indices] = self._compute_mass_near(
+                replace(misses, weight=now.weight * now.confirmed), proposed.position
+            )
             # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
             min_gain = (factor * odds * lost - float(misses.weight.sum())) / max(float(hits.weight.sum()), _MIN_WEIGHT)
             hits = replace(hits, weight=hits.weight * max(1.0, min_gain) ** staleness)
@@ -273,9 +280,10 @@ class Belief:
             for move in moves
         ]
         weight = sum(matrix.sum(0) for matrix in weights)
+        total = weight + arrival_weight
         origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): fraction of a candidate's weight
         stale = origin * (1 - fresh)
-        staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + arrival_weight).sum()))
+        staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float(total.sum()))
         newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
         odds_factor = math.exp(min(0.0, newest - before))
         expected = float(now.weight.sum() * proposed.probability.sum())
@@ -294,13 +302,16 @@ class Belief:
         anchor = (1 - stale.sum(0))[:, None] * position + stale.T @ now.anchor
         is_continued, heading = (weight > arrival_weight)[:, None], np.radians(proposed.heading_deg)
         hypotheses = _Hypotheses(
-            weight=math.exp(-staleness * repeated) * (weight + arrival_weight),
+            weight=math.exp(-staleness * repeated) * total,
             position=np.where(is_continued, fused_position, position),
             covariance=np.where(is_continued[..., None], fused_cov, cov),
             velocity=np.where(is_continued, velocity, np.nan),
             heading=np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1)),
             credited=np.maximum(ratio, 0),
             anchor=np.where(is_continued, anchor, position),
+            confirmed=np.where(
+                proposed.is_certain, 1.0, (origin.T @ now.confirmed) * weight / np.maximum(total, _MIN_DIVISOR)
+            ),
         )
         return hypotheses, likelihood, staleness, odds_factor
 
@@ -357,4 +368,5 @@ def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposal
         position=proposed.position[indices],
         covariance=regularize_covariance(proposed.covariance[indices], (_MIN_SD * scale.spacing) ** 2),
         heading_deg=proposed.heading_deg[indices],
+        is_certain=proposed.is_certain[indices],
     )

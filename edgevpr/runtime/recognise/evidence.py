@@ -82,9 +82,14 @@ class Evidence:
     @property
     def kind(self) -> str:
         """Kind of this evidence, derived from the figures it has."""
-        if self.likeness is not None:
+        if self.looks_ahead:
             return AHEAD_PROVEN if self.proof else AHEAD
         return DOWN if self.landmarks is not None else DOWN_BARE
+
+    @property
+    def looks_ahead(self) -> bool:
+        """True for a forward camera."""
+        return self.likeness is not None
 
     @property
     def has_twin(self) -> bool:

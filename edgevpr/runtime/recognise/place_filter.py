@@ -41,7 +41,8 @@ _MIN_SPACING_M = 5.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackEstimate:
     """Result of a query combined with the flight so far. `slot` is the index row of the most likely place (None: no
-    place), `confidence` the probability that the aircraft is there, and `predicted` that before the query. `lost` is
+    place), `confidence` the probability that the aircraft is there, and `predicted` that before
+    the query (see `Posterior`). `lost` is
     the probability that it is at no position of the belief. `estimate` is its most likely position (None: unknown, or
     the map has no positions), and `mass` the probability that it is near this position."""
 
@@ -243,6 +244,9 @@ def _make_proposals(
     is_near = np.hypot(*(positions - positions[0]).T) <= geometry.scale.near
     is_near[0] = True  # even if its position is unknown
     confidence = rule.confidence(evidence)
+    # Ahead, a sequence of weak matches is evidence enough. Looking down, images of ground outside the map overlap for
+    # long, and may resemble several places of it.
+    is_certain = is_near & (evidence.looks_ahead or confidence >= rule.threshold(evidence))
     others = _OTHERS_CORRECT_FRACTION * max(0.0, rule.compute_map_confidence(evidence) - confidence)
     probability = np.zeros(len(slots))
     if evidence.has_twin:  # more votes only mean that the picture was taken closer to that place
@@ -258,6 +262,7 @@ def _make_proposals(
         position=positions[is_proposed],
         covariance=covariance[is_proposed],
         heading_deg=heading_deg[is_proposed],
+        is_certain=is_certain[is_proposed],
     )
 
 

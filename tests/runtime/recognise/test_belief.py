@@ -14,7 +14,7 @@ STEP = make_motion(1.0, 3.0)  # within three places of the query before
 CERTAIN = 0.999
 
 
-def make_evidence(at, p, sd=0.5, heading_deg=np.nan):
+def make_evidence(at, p, sd=0.5, heading_deg=np.nan, certain=False):
     """Evidence for positions `at` (K, 2), or (K,) in a map of places in order."""
     at = np.asarray(at, float)
     at = np.column_stack([at, np.zeros(len(at))]) if at.ndim == 1 else at
@@ -23,6 +23,7 @@ def make_evidence(at, p, sd=0.5, heading_deg=np.nan):
         position=at,
         covariance=np.tile(sd**2 * np.eye(2), (len(at), 1, 1)),
         heading_deg=np.full(len(at), heading_deg),
+        is_certain=np.full(len(at), certain),
     )
 
 
@@ -91,12 +92,22 @@ def test_update_refuses_foreign_ground_that_resembles_the_map_slightly(p, places
     assert max(masses) < CERTAIN
 
 
-def test_update_predicts_the_place_that_earlier_queries_lead_to():
+def test_update_predicts_the_place_that_a_certain_match_leads_to():
     belief = Belief(ORDER_SCALE)
-    assert belief.update(make_evidence([50], [0.9]), STEP, PLACES).predicted == pytest.approx([0.0])
+    assert belief.update(make_evidence([50], [0.9], certain=True), STEP, PLACES).predicted == pytest.approx([0.0])
     near, far = belief.update(make_evidence([51, 80], [0.4, 0.4]), STEP, PLACES).predicted
     assert near > 0.85
     assert far == 0
+    next_near, next_far = belief.update(make_evidence([52, 80], [0.4, 0.4]), STEP, PLACES).predicted
+    assert next_near > 0.5
+    assert next_far < 1e-6, "it may have jumped there, but nothing led there"
+
+
+def test_update_predicts_nothing_from_uncertain_matches_alone():
+    rng, belief = np.random.default_rng(1), Belief(ORDER_SCALE)
+    posteriors = fly(belief, range(10, 40), rng)
+    assert posteriors[-1].mass > CERTAIN
+    assert max(posterior.predicted.max() for posterior in posteriors) < 1e-6
 
 
 @pytest.mark.parametrize(("distance_m", "is_lost"), [(40.0, False), (120.0, True)])
@@ -158,7 +169,8 @@ def make_random_evidence(rng, count, scale):
     for each in (p, at, covariance):
         if each.size and rng.random() < 0.1:
             each.flat[rng.integers(each.size)] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
-    return Proposals(probability=p, position=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10], count))
+    heading_deg, is_certain = rng.choice([np.nan, 10], count), rng.random(count) < 0.2
+    return Proposals(probability=p, position=at, covariance=covariance, heading_deg=heading_deg, is_certain=is_certain)
 
 
 @pytest.mark.parametrize("ground", [ORDER_SCALE, METRIC_SCALE])
