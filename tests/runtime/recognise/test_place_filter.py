@@ -189,7 +189,7 @@ def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(pos
 
 
 def test_place_filter_predicts_looking_down_only_after_a_certain_match(flight):
-    weak = flight.over(range(10, 40, STRIDE))
+    weak = flight.query_places(range(10, 40, STRIDE))
     assert weak[-1].confidence > CERTAIN
     assert weak[-1].predicted < 1e-6
     flight.query(40, 0.95)
