@@ -24,6 +24,7 @@ from edgevpr.core.arrays import Bools, Doubles, Ints
 from edgevpr.runtime.recognise.gaussians import (
     MIN_VARIANCE_RATIO,
     compute_distances,
+    compute_mean_sd,
     fuse_positions,
     mix_gaussians,
     regularize_covariance,
@@ -161,12 +162,11 @@ class Belief:
     def drop_off_map(self, places: Doubles, sight: float) -> None:
         """Drop each hypothesis that is farther than `sight`, plus its standard deviation, from all `places` (N, 2):
         no ground of the map is in view there, so an aircraft at this position is lost."""
-        now = self._now
-        if not len(now.weight):
-            return
-        distance = np.nanmin(compute_distances(now.position, places), axis=1)
-        is_in_sight = distance <= sight + np.sqrt(np.trace(now.covariance, axis1=1, axis2=2) / 2)
-        self._now = now[np.flatnonzero(is_in_sight)]
+        position = self._now.position
+        # As a product of matrices: ten times faster than differences with ten thousand places.
+        squared = (places**2).sum(1) - 2 * position @ places.T
+        distance = np.sqrt(np.maximum(squared.min(1) + (position**2).sum(1), 0))
+        self._now = self._now[np.flatnonzero(distance <= sight + compute_mean_sd(self._now.covariance))]
         self._lost = max(0.0, 1 - float(self._now.weight.sum()))
 
     def update(self, proposed: Proposals | None, motion: Motion, places: int) -> Posterior:
@@ -205,9 +205,8 @@ class Belief:
 
     def _compute_mass_near(self, moved: _Hypotheses, position: Doubles) -> Doubles:
         """Return the weight (K,) of the hypotheses near each `position` (K, 2), allowing for their covariance."""
-        sd = np.sqrt(np.trace(moved.covariance, axis1=1, axis2=2) / 2)
-        is_near = compute_distances(position, moved.position) <= self._scale.near + _SAME_POSITION_SIGMAS * sd
-        return np.asarray(is_near @ moved.weight)
+        near = self._scale.near + _SAME_POSITION_SIGMAS * compute_mean_sd(moved.covariance)
+        return np.asarray((compute_distances(position, moved.position) <= near) @ moved.weight)
 
     def _apply_transitions(self) -> tuple[_Hypotheses, float, float]:
         """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the
@@ -271,7 +270,7 @@ class Belief:
         # A picture of the same ground repeats the previous evidence. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         repeated, self._strongest = min(before, strongest), strongest
-        sd = np.sqrt(cov[:, 0, 0] if scale.is_ordinal else np.trace(cov, axis1=1, axis2=2) / 2)
+        sd = np.sqrt(cov[:, 0, 0]) if scale.is_ordinal else compute_mean_sd(cov)
         fresh = np.clip((compute_distances(now.anchor, position) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.weight[:, None])
         # For each motion, the weight (M, K) that each hypothesis gives each candidate.
@@ -318,9 +317,9 @@ class Belief:
     def _make_posterior(self, probability: Doubles, predicted: Doubles) -> Posterior:
         """Return the belief with an estimate: the weighted mean of the hypotheses around the one whose
         neighbourhood has the most weight."""
-        now = self._now
+        now, posterior = self._now, Posterior(lost=self._lost, probability=probability, predicted=predicted)
         if not len(now.weight):
-            return Posterior(lost=self._lost, probability=probability, predicted=predicted)
+            return posterior
         is_near = compute_distances(now.position, now.position) <= self._scale.near
         chosen = is_near[(is_near @ now.weight).argmax()]
         mass = float(now.weight[chosen].sum())
@@ -328,8 +327,7 @@ class Belief:
         (position,), (covariance,) = mix_gaussians(weight[None], now.position[chosen], now.covariance[chosen])
         north, east = (weight @ now.heading[chosen]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
-        estimate = Posterior(lost=self._lost, probability=probability, predicted=predicted, mass=mass)
-        return replace(estimate, position=position, covariance=covariance, heading_deg=heading_deg)
+        return replace(posterior, mass=mass, position=position, covariance=covariance, heading_deg=heading_deg)
 
 
 def _predict_misses(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:

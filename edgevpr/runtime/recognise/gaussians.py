@@ -13,6 +13,11 @@ def compute_distances(one: Doubles, other: Doubles) -> Doubles:
     return np.asarray(np.sqrt(((one[:, None] - other) ** 2).sum(2)))
 
 
+def compute_mean_sd(covariance: Doubles) -> Doubles:
+    """Return the standard deviation (M,) along one axis, averaged over all directions, of covariances (M, 2, 2)."""
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2))
+
+
 def regularize_covariance(covariance: Doubles, min_variance: float) -> Doubles:
     """Make covariances (K, 2, 2) invertible: add `min_variance` and a small fraction of the trace to each axis."""
     added: Doubles = min_variance + MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))

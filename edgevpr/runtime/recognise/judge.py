@@ -246,10 +246,8 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     figures = {"track_confidence": track, "confidence": reported, "min_confidence": needed, **evidence.describe()}
     is_confident = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
-    is_predicted = findings.predicted is not None and findings.predicted >= _MIN_PREDICTED
-    if not (
-        is_confident or (track and is_predicted and _is_track_confident(track, confidence, needed, rule.precision))
-    ):
+    is_tracked = track is not None and _is_track_confident(track, confidence, needed, rule.precision)
+    if not (is_confident or (is_tracked and (findings.predicted or 0.0) >= _MIN_PREDICTED)):
         code = ReasonCode.LOW_CONFIDENCE
     elif evidence.lead < 0 and not is_confident:
         code = ReasonCode.ELSEWHERE_AGREES_BETTER

@@ -41,10 +41,9 @@ _MIN_SPACING_M = 5.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackEstimate:
     """Result of a query combined with the flight so far. `slot` is the index row of the most likely place (None: no
-    place), `confidence` the probability that the aircraft is there, and `predicted` that before
-    the query (see `Posterior`). `lost` is
-    the probability that it is at no position of the belief. `estimate` is its most likely position (None: unknown, or
-    the map has no positions), and `mass` the probability that it is near this position."""
+    place), `confidence` the probability that the aircraft is there, and `predicted` the one before the query (see
+    `Posterior`). `lost` is the probability that it is at no position of the belief. `estimate` is its most likely
+    position (None: unknown, or the map has no positions), and `mass` the probability that it is near this position."""
 
     slot: int | None
     confidence: float
@@ -59,17 +58,19 @@ class TrackEstimate:
 
 
 class _MapGeometry:
-    """Measures of a map: the `origin` of the belief's plane (None: the map has no positions), the
-    `scale`, `spread`, the standard deviation of the position of a place without a pose, and `footprint_m`, the largest
-    one of its places (None: unknown)."""
+    """Measures of a map: the `origin` of the belief's plane (None: the map has no positions), the `scale`, `spread`,
+    the standard deviation of the position of a place without a pose, `footprint_m`, the largest one of its places
+    (None: unknown), and `known_positions` (N, 2), those of the places that have one."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
         self.origin = self.footprint_m = None
+        self.known_positions = np.zeros((0, 2))
         self.scale, self.spread = MapScale(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True), 1.0
         if known.mean() > _MIN_MAJORITY:
             first = int(np.flatnonzero(known)[0])
             self.origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
+            self.known_positions = self.positions(np.flatnonzero(known), index)
             layers = read_layers(place_map)
             self.footprint_m = max(layers.footprints_m, default=None)
             spacing_m, footprint_m = index.spacing_m() or 0.0, layers.median_m
@@ -81,7 +82,7 @@ class _MapGeometry:
             )
 
     def find_sight_m(self, view: View) -> float | None:
-        """Return the farthest distance of the aircraft from a place that shares ground with a picture; None: unknown"""
+        """Return the largest distance from which the aircraft sees ground of a place in this view; None: unknown."""
         if not (self.footprint_m and view.footprint_m and view.nadir_offset):
             return None
         return self.footprint_m / 2 + view.footprint_m * (0.5 + math.hypot(*view.nadir_offset))
@@ -145,7 +146,7 @@ class PlaceFilter:
         slots, proposed = _make_proposals(ranking, index, geometry, rule, evidence, located)
         self._next = copy.copy(self._belief)
         if (sight_m := geometry.find_sight_m(view)) is not None:
-            self._next.drop_off_map(geometry.positions(np.arange(len(index)), index), sight_m)
+            self._next.drop_off_map(geometry.known_positions, sight_m)
         posterior = self._next.update(proposed, self._make_motion(geometry), len(index))
         slot, confidence, predicted = None, 0.0, 0.0
         if len(slots) and posterior.probability.max() > 0:

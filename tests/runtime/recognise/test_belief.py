@@ -114,7 +114,7 @@ def test_update_predicts_nothing_from_uncertain_matches_alone():
 def test_drop_off_map_makes_an_aircraft_lost_where_no_place_is_in_sight(distance_m, is_lost):
     belief = Belief(METRIC_SCALE)
     belief.update(make_evidence([[0.0, 0.0]], [0.99], sd=5.0), make_motion(1.0, 30.0), PLACES)
-    belief.drop_off_map(np.array([[distance_m, 0.0], [np.nan, np.nan]]), sight=100.0)
+    belief.drop_off_map(np.array([[distance_m, 0.0], [0.0, 300.0]]), sight=100.0)
     lost = belief.update(None, make_motion(1.0, 30.0), PLACES).lost
     assert lost == pytest.approx(1.0) if is_lost else lost < 0.1
 
