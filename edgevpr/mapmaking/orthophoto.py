@@ -1,5 +1,13 @@
-"""Cuts square pictures of the ground out of an orthophoto, with sides in metres and true north up."""
+"""Cuts square pictures of the ground out of an orthophoto, with sides in metres and true north up.
 
+rasterio (GDAL and PROJ) reads the file. Other modules import `transform` from here, because this module raises a clear
+error if rasterio is missing.
+"""
+
+import logging
+import math
+import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -8,22 +16,33 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Image
-from edgevpr.core.errors import SourceError
+from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resize
-from edgevpr.mapmaking.georaster import (
-    CRS,
-    HALF_WORLD_M,
-    WGS84,
-    CPLE_BaseError,
-    GeoRaster,
-    RasterioError,
-    make_local_crs,
-    rasterio,
-    transform,
-)
 
+# GDAL's block cache in MB; GDAL reads this on first use. Its default is 5 % of the RAM.
+os.environ.setdefault("GDAL_CACHEMAX", "64")
+
+try:
+    import rasterio
+    from rasterio._err import CPLE_BaseError
+    from rasterio.crs import CRS
+    from rasterio.enums import ColorInterp, Resampling
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.warp import transform as transform
+    from rasterio.windows import Window
+except ModuleNotFoundError as error:
+    raise SourceError(
+        f"Orthophotos require rasterio, and {error.name} is not installed: run `pip install rasterio scipy shapely`."
+    ) from error
+
+logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each fault once, in its own words
+
+_COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
+WGS84 = CRS.from_epsg(4326)
+_WEB_MERCATOR = CRS.from_epsg(3857)
+_WEB_MERCATOR_M = 2 * math.pi * 6_378_137.0  # its width
 _EDGE_POINTS = 25  # per edge, because a straight edge of the file is a curve in another coordinate system
 _MAX_HALVINGS = 8  # of the resolution; eight reduce a tile of 256 pixels to one
 
@@ -48,11 +67,24 @@ class Orthophoto:
                 "(docs/how-to/map-from-an-orthophoto.md)."
             )
         self.name, self.short_name = str(path), path.name
-        self._raster = GeoRaster(path)
-        is_mercator = self._raster.crs == CRS.from_epsg(3857)
-        self._wrap = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:
-            columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                self._data = rasterio.open(path)
+        except (RasterioError, OSError) as error:
+            raise SourceError(
+                f"{self.name} cannot be opened as an orthophoto: use a GeoTIFF, VRT or MBTiles file."
+            ) from error
+        self._bands = self._find_colour_bands()
+        self._locate()
+
+    def _locate(self) -> None:
+        """Compute where the orthophoto is. Closes the file and raises SourceError if its coordinate system cannot be
+        converted."""
+        crs = self._data.crs
+        self._wrap = 360 if crs.is_geographic else _WEB_MERCATOR_M if crs == _WEB_MERCATOR else 0
+        try:
+            columns, rows = np.array([[self._data.width / 2], [self._data.height / 2]])
             (lon_deg,), (lat_deg,) = self._to_crs(columns, rows, WGS84)
             self.middle = Position(lat_deg, wrap_deg(lon_deg))
             lons_deg, lats_deg = self.compute_outline(WGS84)
@@ -61,7 +93,7 @@ class Orthophoto:
         if not np.isfinite((lats_deg, lons_deg)).all():
             self.close()
             raise SourceError(
-                f"{self.name}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be converted to "
+                f"{self.name}: its coordinate system ({crs.to_string()[:60]}) cannot be converted to "
                 "latitude and longitude: export the orthophoto in another one, such as UTM or EPSG:4326."
             )
         lons_deg = self.middle.lon_deg + wrap_deg(lons_deg - self.middle.lon_deg)
@@ -69,31 +101,54 @@ class Orthophoto:
         metre_px = self._to_pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))
 
+    def _find_colour_bands(self) -> list[int]:
+        """Return the band numbers (from 1) of blue, green and red, or of grey. Closes an unusable file and raises
+        SourceError."""
+        interpretations, dtypes = self._data.colorinterp, self._data.dtypes
+        colours = [interpretations.index(colour) + 1 for colour in _COLOURS if colour in interpretations]
+        others = [number for number, kind in enumerate(interpretations, start=1) if kind != ColorInterp.alpha]
+        if len(colours) < 3:
+            colours = others[2::-1] if len(others) >= 3 else others[:1]
+        fault = None
+        if not self._data.crs or self._data.transform.is_identity:
+            fault = "it has no georeference (coordinate system and position)"
+        elif ColorInterp.palette in interpretations:
+            fault = "its colours are palette indices (convert it with `gdal_translate -expand rgb`)"
+        elif not colours or any(dtypes[band - 1] != "uint8" for band in colours):
+            fault = (
+                f"it contains {dtypes[0]} values, such as heights, not an 8-bit picture (convert a 16-bit picture "
+                "with `gdal_translate -ot Byte -scale`)"
+            )
+        if fault:
+            self.close()
+            raise SourceError(f"{self.name} is not a usable orthophoto: {fault}.")
+        return colours
+
     def compute_outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
         """Return points along the edges of the file, x and y in the coordinate system `crs`, float64 (N,) each."""
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
-        columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
-        rows = np.concatenate((zero, zero + 1, along, along)) * self._raster.height
+        columns = np.concatenate((along, along, zero, zero + 1)) * self._data.width
+        rows = np.concatenate((zero, zero + 1, along, along)) * self._data.height
         return self._to_crs(columns, rows, crs)
 
     def _to_crs(self, columns: Doubles, rows: Doubles, crs: CRS) -> tuple[Doubles, Doubles]:
         """Convert the pixels at `columns` and `rows`, float (N,) each, to x and y in the coordinate system `crs`,
         float64 (N,) each."""
-        x, y = transform(self._raster.crs, crs, *_apply_affine(self._raster.transform, columns, rows))
+        x, y = transform(self._data.crs, crs, *_apply_affine(self._data.transform, columns, rows))
         return np.array(x), np.array(y)
 
     def _to_pixels(self, origin: Position, points_m: Doubles) -> Doubles:
         """Convert points (N, 2), metres (east, north) from `origin`, to pixels (column, row), float64 (N, 2). Pixel
         corners have integer coordinates."""
-        return np.column_stack(self._crs_to_pixels(*transform(make_local_crs(origin), self._raster.crs, *points_m.T)))
+        return np.column_stack(self._crs_to_pixels(*transform(make_local_crs(origin), self._data.crs, *points_m.T)))
 
     def _crs_to_pixels(self, x: Sequence[float], y: Sequence[float]) -> tuple[Doubles, Doubles]:
         """Convert points from the coordinate system of the file to pixels: columns and rows, float64 (N,) each."""
-        raster, across = self._raster, np.array(x)
+        affine, across = self._data.transform, np.array(x)
         if self._wrap:  # the longitudes of a file may run from 0 to 360 degrees, or cross the date line
-            middle, _ = _apply_affine(raster.transform, raster.width / 2, raster.height / 2)
+            middle, _ = _apply_affine(affine, self._data.width / 2, self._data.height / 2)
             across += self._wrap * np.round((middle - across) / self._wrap)
-        return _apply_affine(~raster.transform, across, np.array(y))
+        return _apply_affine(~affine, across, np.array(y))
 
     def cut(self, centre: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
         """Cut out a square of ground around `centre`, true north up, with sides of `footprint_m`.
@@ -108,12 +163,12 @@ class Orthophoto:
         source_px = np.hypot(*(corners[1] - corners[0]))
         # The file is reduced by this power of two before it is warped.
         shrink = 1 << min(int(np.log2(max(source_px / side_px, 1))), _MAX_HALVINGS)
-        size = np.array([self._raster.width, self._raster.height])
+        size = np.array([self._data.width, self._data.height])
         low = np.clip(corners.min(axis=0) - 2 * shrink, 0, size).astype(int) // shrink * shrink
         high = np.clip(corners.max(axis=0) + 3 * shrink, 0, size).astype(int) // shrink * shrink
         if (high <= low).any():
             return _make_blank(side_px)
-        ground, valid = self._raster.read(tuple(low.tolist()), tuple(high.tolist()), shrink)
+        ground, valid = self._read(low.tolist(), high.tolist(), shrink)
         # Warp to twice the size and average, so that no pixel of the file is skipped.
         large_px = 2 * side_px
         target = np.array([[0, 0], [large_px, 0], [large_px, large_px], [0, large_px]])
@@ -130,9 +185,29 @@ class Orthophoto:
             picture[~has_data] = picture[has_data].mean(axis=0)
         return picture, has_data
 
+    def _read(self, low: Sequence[int], high: Sequence[int], shrink: int) -> tuple[Image, Bools]:
+        """Read the window from (column, row) `low` to `high` (exclusive), reduced by the factor `shrink`: each pixel of
+        the result is the mean of `shrink` x `shrink` pixels. The window's sides must be multiples of `shrink`.
+
+        Returns the picture, uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError if the
+        window is damaged.
+        """
+        width, height = high[0] - low[0], high[1] - low[1]
+        shape, window = (height // shrink, width // shrink), Window(*low, width, height)
+        try:
+            bands = self._data.read(
+                self._bands, window=window, out_shape=(len(self._bands), *shape), resampling=Resampling.average
+            )
+            valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
+        except RasterioError as error:
+            raise ImageError(
+                f"{self.name} cannot be read at column {low[0]}, row {low[1]} ({error}): copy the file again."
+            ) from error
+        return np.ascontiguousarray(np.broadcast_to(bands.transpose(1, 2, 0), (*shape, 3))), valid
+
     def close(self) -> None:
         """Close the file."""
-        self._raster.close()
+        self._data.close()
 
 
 def _apply_affine(affine: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
@@ -142,3 +217,10 @@ def _apply_affine(affine: rasterio.Affine, x: Coordinate, y: Coordinate) -> tupl
 
 def _make_blank(side_px: int) -> tuple[Image, Bools]:
     return np.zeros((side_px, side_px, 3), np.uint8), np.zeros((side_px, side_px), bool)
+
+
+def make_local_crs(origin: Position) -> CRS:
+    """Return the azimuthal equidistant projection around `origin`: metres east and true north of that point. Distances
+    and directions from that point are exact."""
+    lat_deg, lon_deg = origin.lat_deg, origin.lon_deg
+    return CRS.from_proj4(f"+proj=aeqd +lat_0={lat_deg:.10f} +lon_0={lon_deg:.10f} +datum=WGS84 +units=m")

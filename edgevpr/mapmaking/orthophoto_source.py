@@ -19,9 +19,8 @@ from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
-from edgevpr.mapmaking.georaster import WGS84, make_local_crs, transform
 from edgevpr.mapmaking.missions import Area, read_area, shapely
-from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.orthophoto import WGS84, Orthophoto, make_local_crs, transform
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.pictures import OrthophotoGrid
