@@ -16,8 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -35,7 +34,6 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 Progress = Callable[[int, int, str], None]  # called with the number of items done, their total, and a label
-T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -110,9 +108,7 @@ class Map:
     def __enter__(self) -> "Map":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __len__(self) -> int:
@@ -225,7 +221,7 @@ def build(
 
 
 def _wrap_progress(progress: Progress) -> Any:
-    def report(items: Iterable[T], total: int, label: str) -> Iterator[T]:
+    def report(items: Iterable[Any], total: int, label: str) -> Iterator[Any]:
         for done, item in enumerate(items, 1):
             yield item
             progress(done, total, label)

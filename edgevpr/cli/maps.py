@@ -257,7 +257,7 @@ def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, fl
         look_alikes = list(find_look_alikes(place_map, queries))
     name = Path(args.map).name
     page = make_map_page(name, lines, places, recognisable, look_alikes, pictures, lens)
-    write_output(args.page, args.map, lambda out: out.write(page))
+    write_output(args.page, args.map, page)
     if not args.json:
         print(f"{args.page}: {len(places)} places of {args.map}")
 

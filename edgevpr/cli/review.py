@@ -55,7 +55,7 @@ def run_report(args: Namespace) -> int:
             no_ground = f"The map of the flight is not drawn: {error} If it has moved, pass its path with --map."
     references = make_map_album(args.map_images, ground)
     page = make_flight_page(flight, ground, frames, references, no_ground)
-    write_output(args.out, args.log, lambda out: out.write(page))
+    write_output(args.out, args.log, page)
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0
 

@@ -17,14 +17,13 @@ from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, TextIO, TypeVar
+from typing import Any
 
 from edgevpr.cli.examples import format_examples
 from edgevpr.core.config import Config, list_keys, load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import sanitize, suggest
 
-T = TypeVar("T")
 _PREFIX = "key "  # prefix of `Namespace` attributes that hold configuration keys
 _HELP_COLUMNS = 78
 _UNITS = {
@@ -245,15 +244,9 @@ def check_output(target: str, source: str) -> Path:
     return path
 
 
-def write_output(target: str, source: str, write: Callable[[TextIO], T]) -> T:
-    """Write the file `target` completely or not at all: call `write` with the open text file and return its result.
-    Raises UsageError as `check_output` does."""
+def write_output(target: str, source: str, text: str) -> None:
+    """Write `text` to the file `target`, completely or not at all. Raises UsageError as `check_output` does."""
     from edgevpr.core.files import write_atomically
 
-    path = check_output(target, source)
-
-    def write_text(unfinished: Path) -> T:
-        with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as out:
-            return write(out)
-
-    return write_atomically(path, write_text)
+    content = text.encode("utf-8", "backslashreplace")
+    write_atomically(check_output(target, source), lambda path: path.write_bytes(content))

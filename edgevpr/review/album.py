@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.text import progress
 from edgevpr.core.types import Place
-from edgevpr.frames.positions import GeoTag
-
-if TYPE_CHECKING:
-    from edgevpr.frames.level import Lens
+from edgevpr.frames.images import decode_jpeg, encode_small_jpeg, encode_small_webp, read_image
+from edgevpr.frames.level import Lens, level_image
+from edgevpr.frames.positions import GeoTag, find_track, read_track
+from edgevpr.frames.source import make_frame, open_source, read_tags, read_to_end
 
 _SIDES_PX = (480, 320, 240, 160, 112)  # longest sides of a small picture: the largest that fits is used
 _MIN_BYTES = 2500  # typical size of the data: URL of a picture with the smallest side
@@ -58,31 +57,24 @@ class Album:
     def find_image(self, name: str) -> Image | None:
         """Return the picture `name`, uint8 (H, W[, 3]); None if no such picture can be read."""
         if name in self._copies:
-            from edgevpr.frames.images import decode_jpeg
-
             return decode_jpeg(self._copies[name])
         picture = self._find(name)
         return picture.image if picture else None
 
-    def level_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
+    def level_picture(self, place: Place, lens: Lens | None) -> AlbumPicture | None:
         """Return the picture of a place, levelled if the `lens` is known; None if the picture is not found."""
         picture = self._find(place.source_image)
         if picture is None:
             return None
-        from edgevpr.frames.images import encode_small_jpeg
-
         # Photographs are slow to decode, so a small copy replaces the second read of the file.
         self._copies[place.source_image] = encode_small_jpeg(picture.image, _SIDES_PX[0])
         tag = picture.tag() if lens and picture.tag else None
         if lens is None or tag is None:
             return picture
-        from edgevpr.frames.level import level_image
-        from edgevpr.frames.source import make_frame
-
         level = level_image(make_frame(picture.image, place.source_image, 0.0, tag), None, lens, below=True)
         return AlbumPicture(level.image, level.mask)
 
-    def align_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
+    def align_picture(self, place: Place, lens: Lens | None) -> AlbumPicture | None:
         """Return the picture of a place in the orientation of its pose: either levelled and north-up (as in a map built
         with the `lens`) or as taken. None if it is not found or its heading contradicts both."""
         picture = self._find(place.source_image)
@@ -102,8 +94,6 @@ class Album:
 
 
 def _read_picture(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPicture | None:
-    from edgevpr.frames.images import read_image  # imported here: a page without pictures needs no OpenCV
-
     with suppress(ImageError, OSError, ValueError):  # not a picture, or an invalid file name
         if path.is_file():
             return AlbumPicture(read_image(path), tag=tag)
@@ -118,8 +108,6 @@ def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
 
 @cache
 def _read_folder_tags(folder: Path) -> Mapping[Path, GeoTag]:
-    from edgevpr.frames.source import read_tags
-
     with suppress(EdgevprError):
         return read_tags(folder)
     return {}
@@ -130,17 +118,12 @@ class _VideoFinder:
     has an unusable table of positions next to it."""
 
     def __init__(self, video: Path) -> None:
-        from edgevpr.frames.positions import find_track, read_track
-        from edgevpr.frames.source import open_source
-
         table = find_track(video)
         self._track = read_track(table) if table else None
         self._open = partial(open_source, str(video), live=False)
         self._source, self._last_name = self._open(), ""
 
     def __call__(self, name: str) -> AlbumPicture | None:
-        from edgevpr.frames.source import read_to_end
-
         match = _FRAME_NAME.fullmatch(name)
         if not match:
             return None
@@ -201,8 +184,6 @@ def embed_pictures(
     """Load the pictures of all steps as data: URLs of at most `budget_bytes` together. Each is as large as its part
     of the budget allows; if that is too little, only every second, third, ... step has pictures. Returns the URLs by
     key, and a sentence on what is left out ("": nothing)."""
-    from edgevpr.frames.images import encode_small_webp
-
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
     interval = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(budget_bytes))))
     keys = list(dict.fromkeys(key for step in steps[::interval] for key in step if albums[key[0]]))

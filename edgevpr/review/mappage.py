@@ -3,21 +3,19 @@ them, inconsistent GPS tags, and places that look alike."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edgevpr.core.geodesy import distance_m, offset_m, offset_position, picture_axes
 from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
+from edgevpr.frames.images import cv2
+from edgevpr.frames.level import Lens
 from edgevpr.mapmaking.look_alikes import FoundLookAlike
 from edgevpr.places.mapinfo import find_inconsistent_tags
 from edgevpr.review.album import Album
 from edgevpr.review.logged import Point
 from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, format_number, make_layer, make_page, to_point
-
-if TYPE_CHECKING:
-    from edgevpr.frames.level import Lens
 
 MAX_QUERIES = 100  # images of a map that are matched against the other places; each takes half a second
 _QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # upper limits of the classes
@@ -46,7 +44,7 @@ def make_map_page(
     mean_confidences: Mapping[int, float],
     look_alikes: Sequence[FoundLookAlike | None],
     pictures: Album,
-    lens: "Lens | None",
+    lens: Lens | None,
 ) -> str:
     """Return the complete page for the map `name`. `lines`: the output of `map info`. `mean_confidences`: of the
     correct matches of each place that calibration queried, by place number. `look_alikes`: for each place searched, the
@@ -163,8 +161,6 @@ def find_gaps(places: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     posed = [(place, place.pose) for place in places if place.pose]
     if not posed:
         return [], 0.0, 0.0
-    from edgevpr.frames.images import cv2
-
     origin = to_point(posed[0][0])
     centres_m = np.array([offset_m(*origin, *to_point(place)) for place, _ in posed])
     footprint_m = float(np.median([pose.footprint_m for _, pose in posed]))

@@ -5,10 +5,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
+from edgevpr.frames.level import Lens, Mount
 from edgevpr.review.album import Album
 from edgevpr.review.logged import (
     SENT_OUTCOMES,
@@ -33,9 +34,6 @@ from edgevpr.review.webpage import (
     make_page,
     to_point,
 )
-
-if TYPE_CHECKING:
-    from edgevpr.frames.level import Lens
 
 _MAX_REMARKS = 200
 _MAX_GPS_ERROR_M = 15.0  # smaller distances are within the receiver's error, and not dangerous
@@ -151,14 +149,12 @@ def _format_position(query: LoggedQuery) -> str:
     return f"position {query.position[0]:.6f}, {query.position[1]:.6f}{accuracy}{distance}"
 
 
-def _read_lens(start: Mapping[str, Any]) -> "Lens | None":
+def _read_lens(start: Mapping[str, Any]) -> Lens | None:
     """Return the lens of the flight's camera from the first line of its log; None if it is unknown."""
     names = ("fov_deg", "up_deg", "mount_ahead_deg", "mount_right_deg")
     fov_deg, up_deg, ahead_deg, right_deg = (get_number(start, "config", "source", name) for name in names)
     if fov_deg is None or not 0 < fov_deg < 180:
         return None
-    from edgevpr.frames.level import Lens, Mount  # loads OpenCV
-
     return Lens(fov_deg, up_deg or 0.0, mount=Mount(ahead_deg or 0.0, right_deg or 0.0))
 
 

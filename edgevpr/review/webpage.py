@@ -9,19 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import sanitize
 from edgevpr.core.types import Place
+from edgevpr.frames.level import Lens
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.review.album import Album, AlbumPicture, embed_pictures
 from edgevpr.review.logged import Point
-
-if TYPE_CHECKING:
-    from edgevpr.frames.level import Lens
 
 Form = Literal["dots", "line", "area"]
 
@@ -123,7 +121,7 @@ def make_page(
     layers: Sequence[Layer],
     albums: Mapping[str, Album],
     *,
-    lens: "Lens | None" = None,
+    lens: Lens | None = None,
     notes: Sequence[str] = (),
     charts: Sequence[Chart] = (),
     sections: Sequence[Section] = (),
@@ -215,7 +213,7 @@ def _serialise_step(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -
     }
 
 
-def _make_ground_album(album: Album, places: Sequence[Place], lens: "Lens | None") -> Album:
+def _make_ground_album(album: Album, places: Sequence[Place], lens: Lens | None) -> Album:
     """Return the album of the map's pictures aligned with its poses, transparent where they show no ground."""
     by_name = {place.source_image: place for place in places if place.pose}
 
