@@ -17,6 +17,7 @@ from edgevpr.frames.images import list_images
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.lab.evaluate.dataset import ScoredQuery
 from edgevpr.mapmaking.calibrate import count_queries, query_map
+from edgevpr.mapmaking.look_alikes import MapSearch
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.evidence import Evidence
@@ -94,7 +95,7 @@ def yield_rows(name: str, folder: Path) -> Iterator[Row]:
         frames = [frames[number] for number in np.resize(order, min(count_queries(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.read_places()}
         pictures = ((ids[frame.name], LevelledImage(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
-        for answer in query_map(technique, place_map, index, rule, walks.make_meter(), pictures):
+        for answer in query_map(MapSearch(place_map, technique, rule, walks.make_meter()), pictures):
             if answer.evidence is not None:
                 fields = {"kind": answer.way, "right": answer.right, "evidence": answer.evidence}
                 yield Row(map=name, set=name, query=str(answer.place_id), near=False, score=0.0, **fields)

@@ -29,7 +29,6 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.level import LevelledImage
 from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
-from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.places.rows import escape_name
@@ -46,7 +45,7 @@ from edgevpr.runtime.recognise.evidence import (
     count_neighbours,
     list_evidence_kinds,
 )
-from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule, make_accept_rule
+from edgevpr.runtime.recognise.judge import ConfidenceRule, make_accept_rule
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the available frames with these names
 
@@ -80,23 +79,15 @@ class QueryResult:
     refused: bool = False
 
 
-def query_map(
-    technique: Technique,
-    place_map: PlaceMap,
-    index: PlaceIndex,
-    rule: AcceptRule,
-    meter: QueryMeter,
-    pictures: Iterable[tuple[int, LevelledImage]],
-    seed: int = 0,
-) -> Iterator[QueryResult]:
-    """Query the map with altered pictures of its own places, in all three ways, and yield the results. `index` holds
-    the places of `place_map`; `rule` decides whether a match is accepted. `pictures` are pairs of a place id and its
-    picture as encoded for the map. Places that are not in the index are skipped."""
+def query_map(search: MapSearch, pictures: Iterable[tuple[int, LevelledImage]], seed: int = 0) -> Iterator[QueryResult]:
+    """Query the map with altered pictures of its own places, in all three ways, and yield the results. `pictures` are
+    pairs of a place id and its picture as encoded for the map. Places that are not in the index are skipped. The rule
+    of the `search` is changed to reject hardly any match for low confidence."""
     rng = np.random.default_rng((_SEED, seed))
-    assert rule.confidence_rule is not None  # set for techniques with a confidence model
-    low_precision_rule = replace(rule.confidence_rule, precision=_LOW_PRECISION)
-    rule = replace(rule, confidence_rule=low_precision_rule)
-    search = MapSearch(technique, place_map, index, rule, meter=meter)
+    assert search.rule.confidence_rule is not None  # set for techniques with a confidence model
+    low_precision_rule = replace(search.rule.confidence_rule, precision=_LOW_PRECISION)
+    search.rule = replace(search.rule, confidence_rule=low_precision_rule)
+    index, looks_down = search.index, search.technique.spec.looks_down
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
             continue
@@ -105,13 +96,13 @@ def query_map(
         for way, original, candidates in (*ways, (MIRRORED, _mirror_picture(picture), index)):
             if not len(candidates):
                 continue
-            image, mask = change_picture(original.image, rng, technique.spec.looks_down, original.mask)
+            image, mask = change_picture(original.image, rng, looks_down, original.mask)
             event = search.find(place_id, image, mask, candidates)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield QueryResult(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = search.slots[event.best.place.place_id]
-            max_slots = count_neighbours(rule.look_alikes)
+            max_slots = count_neighbours(search.rule.look_alikes)
             right = (
                 way == THERE
                 and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, max_slots=max_slots)[0]
@@ -144,30 +135,31 @@ def calibrate(
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)
     require(kinds, f"{technique.spec.name} judges matches by score and margin; only `cohog` computes a confidence")
-    index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
+    search = MapSearch(place_map, technique, make_accept_rule(technique, config), meter)
+    index = search.index
     require(len(index) >= MIN_PLACES, f"it has {len(index)} places, but {MIN_PLACES} are needed")
     has_positions = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
     require(has_positions, "too many places lack a position, so it is unknown which of them show the same ground")
-    rule = make_accept_rule(technique, config)
     if not technique.spec.looks_down:
-        near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
         descriptors = (
             (place_id, encoded.descriptor)
             for place_id, encoded in _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
         )
-        rule = replace(rule, look_alikes=measure_look_alikes(technique, place_map, index, near_m, descriptors))
+        search.rule = replace(search.rule, look_alikes=measure_look_alikes(search, descriptors))
     count = count_queries(technique)
     queries = (
         (place_id, frame.picture) for place_id, frame in _encode_pictures(encoder, place_map, pictures, progress, count)
     )
-    results = list(query_map(technique, place_map, index, rule, meter, queries))
+    results = list(query_map(search, queries))
     place_count = len({result.place_id for result in results})
     require(
         place_count >= MIN_PLACES,
         f"pictures of only {place_count} places were found, but {MIN_PLACES} are needed; pass the pictures that it was "
         "made from, with the same camera and mask",
     )
-    calibration = replace(_fit_calibration(results, kinds, config.accept_precision), look_alikes=rule.look_alikes)
+    calibration = replace(
+        _fit_calibration(results, kinds, config.accept_precision), look_alikes=search.rule.look_alikes
+    )
     place_map.record_calibration(format_calibration(calibration))
     return calibration
 

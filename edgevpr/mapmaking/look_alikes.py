@@ -16,7 +16,7 @@ from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import OverlayMask
-from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
+from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import MAX_NEIGHBOUR_SLOTS, outside_neighbourhood
@@ -48,52 +48,44 @@ _DIGITS = 3  # decimals of stored agreements
 
 
 class MapSearch:
-    """Searches an open map for pictures, each as an independent query. `slots`: the slot of each place in `index`.
-    `near_m`: distance in metres within which places count as neighbours, at least a footprint."""
+    """Searches an open map, with all its places in `index`, for pictures, each as an independent query. `rule` decides
+    whether a match is accepted. `slots`: the slot of each place in `index`. `near_m`: distance in metres within which
+    places count as neighbours, at least a footprint. Raises MapError if the map cannot be read."""
 
-    def __init__(
-        self, technique: Technique, place_map: PlaceMap, index: PlaceIndex, rule: AcceptRule, *, meter: QueryMeter
-    ) -> None:
-        self._technique, self._place_map, self._meter = technique, place_map, meter
-        self._index, self._rule = index, rule
-        self._layers = read_layers(place_map)
-        self.near_m = max(rule.neighbour_m, self._layers.median_m or index.spacing_m() or 0.0)
-        self.slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
+    def __init__(self, place_map: PlaceMap, technique: Technique, rule: AcceptRule, meter: QueryMeter) -> None:
+        self.technique, self.place_map, self.rule, self._meter = technique, place_map, rule, meter
+        self.index, self._layers = load_index(place_map, technique), read_layers(place_map)
+        self.near_m = max(rule.neighbour_m, self._layers.median_m or self.index.spacing_m() or 0.0)
+        self.slots = {int(place_id): slot for slot, place_id in enumerate(self.index.place_ids)}
 
     def find_same_ground(self, slot: int) -> Bools:
         """Return bool (N,), True for each place in the index that may share ground with the place `slot`."""
-        index = self._index
+        index = self.index
         distances_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
         slots_away = abs(np.arange(len(index)) - slot)
-        follows_route = count_neighbours(self._rule.look_alikes) > 0
+        follows_route = count_neighbours(self.rule.look_alikes) > 0
         is_adjacent = slots_away <= (_MAX_OVERLAP_SLOTS if follows_route else 0)
         return np.where(np.isnan(distances_m), is_adjacent, distances_m <= _MAX_OVERLAP_FOOTPRINTS * self.near_m)
 
     def find(self, place_id: int, image: Image, mask: Mask | None, candidates: PlaceIndex) -> Recognition:
         """Search the places of `candidates` for a picture of the place `place_id`. `mask`, bool (H, W), is False where
         the picture shows no ground (None: it shows ground everywhere)."""
-        encoder = FrameEncoder(technique=self._technique, mask=None if mask is None else OverlayMask(mask, sha256=""))
-        matcher = Matcher(candidates, self._rule, layers=self._layers)
-        settings = MatchSettings(candidates=self._technique.candidates, all_evidence=True)
-        recogniser = Recogniser(encoder, self._place_map, matcher, self._meter, settings=settings)
+        encoder = FrameEncoder(technique=self.technique, mask=None if mask is None else OverlayMask(mask, sha256=""))
+        matcher = Matcher(candidates, self.rule, layers=self._layers)
+        settings = MatchSettings(candidates=self.technique.candidates, all_evidence=True)
+        recogniser = Recogniser(encoder, self.place_map, matcher, self._meter, settings=settings)
         return recogniser.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
 
-def measure_look_alikes(
-    technique: Technique,
-    place_map: PlaceMap,
-    index: PlaceIndex,
-    near_m: float,
-    pictures: Iterable[tuple[int, Descriptor]],
-) -> LookAlikes:
+def measure_look_alikes(search: MapSearch, pictures: Iterable[tuple[int, Descriptor]]) -> LookAlikes:
     """Compare the pictures of a map for a forward camera with its places: the neighbours in mapping order, and those
-    elsewhere that a search finds. `pictures`: pairs of a place id and the descriptor of its picture. `near_m`: as
-    `neighbour_m` in `outside_neighbourhood`. Raises MapError if the map cannot be read."""
-    slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
+    elsewhere that a search finds. `pictures`: pairs of a place id and the descriptor of its picture. Raises MapError if
+    the map cannot be read."""
+    index, slots = search.index, search.slots
     all_slots = np.arange(len(index))
 
     def select_elsewhere(slot: int, max_slots: int) -> Bools:
-        is_elsewhere: Bools = outside_neighbourhood(index, slot, all_slots, near_m, max_slots=max_slots)
+        is_elsewhere: Bools = outside_neighbourhood(index, slot, all_slots, search.near_m, max_slots=max_slots)
         return np.asarray(is_elsewhere & (all_slots != slot))
 
     def select_adjacent(slot: int) -> Bools:
@@ -110,7 +102,7 @@ def measure_look_alikes(
             continue
         elsewhere = select_elsewhere(slot, MAX_NEIGHBOUR_SLOTS) & ~select_adjacent(slot)
         parts = elsewhere, ~elsewhere & (all_slots != slot), select_opposite(slot)
-        for other, agreement in _search_parts(technique, place_map, index, descriptor, parts):
+        for other, agreement in _search_parts(search, descriptor, parts):
             for one, two in ((slot, other), (other, slot)):
                 agreements[one][two] = max(agreement, agreements[one].get(two, agreement))
     best_adjacent = {slot: _find_best(others, select_adjacent(slot))[1] for slot, others in agreements.items()}
@@ -135,11 +127,10 @@ def _find_best(agreements: Mapping[int, float], is_selected: Bools) -> tuple[int
     return slot, log_share(0.0) if slot is None else agreements[slot]
 
 
-def _search_parts(
-    technique: Technique, place_map: PlaceMap, index: PlaceIndex, descriptor: Descriptor, parts: Iterable[Bools]
-) -> Iterator[tuple[int, float]]:
-    """Search each of the `parts` of an index, bool (N,) each, for a picture. Yield the slots of the places compared in
+def _search_parts(search: MapSearch, descriptor: Descriptor, parts: Iterable[Bools]) -> Iterator[tuple[int, float]]:
+    """Search each of the `parts` of the index, bool (N,) each, for a picture. Yield the slots of the places compared in
     full, and the logarithms of their agreement."""
+    technique, place_map, index = search.technique, search.place_map, search.index
     for part in parts:
         slots = np.flatnonzero(part)
         if len(slots):
@@ -166,9 +157,9 @@ def find_look_alikes(
     technique = create_technique(place_map)
     if not list_evidence_kinds(technique.spec):
         return
-    index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
     rule = make_accept_rule(technique, MatchConfig(), 1, read_calibration_for(place_map))
-    search = MapSearch(technique, place_map, index, rule, meter=QueryMeter(load_board("this")))
+    search = MapSearch(place_map, technique, rule, QueryMeter(load_board("this")))
+    index = search.index
     for place_id, image, mask in pictures:
         slot = search.slots.get(place_id)
         if slot is None or np.isnan(index.lat_deg[slot]):

@@ -45,11 +45,11 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
     slopes: list[Doubles] = []
     reference: Features | None = None
     for features in filter(None, (detect_features(orb, image) for image in images)):
-        motion = _measure_motion(reference, features) if reference else None
-        if motion and motion.length < _MIN_MOTION:
-            continue  # taken in quick succession, so wait for an image with more motion
-        if motion:
-            slopes.append(motion.slope)
+        if reference and (measured := _measure_motion(reference, features)):
+            motion, slope = measured
+            if motion < _MIN_MOTION:
+                continue  # taken in quick succession, so wait for an image with more motion
+            slopes.append(slope)
         reference = features
     if len(slopes) < MIN_PAIRS:
         return None
@@ -93,16 +93,10 @@ def match_features(first: Features, second: Features) -> tuple[Doubles, Doubles]
     return start[is_inlier], end[is_inlier]
 
 
-class _Motion(NamedTuple):
-    """Motion between two images. `length`: motion at the centre, as a fraction of the longest side. `slope` (2,):
-    relative change of the motion per longest side, to the right and down, which is tan(tilt) / focal length."""
-
-    length: float
-    slope: Doubles
-
-
-def _measure_motion(first: Features, second: Features) -> _Motion | None:
-    """Return the motion between two images; None if they share too little ground."""
+def _measure_motion(first: Features, second: Features) -> tuple[float, Doubles] | None:
+    """Return the motion at the centre between two images, as a fraction of the longest side, and the relative change of
+    the motion per longest side, (2,) to the right and down, which is tan(tilt) / focal length; None if they share too
+    little ground."""
     pairs = match_features(first, second)
     if pairs is None:
         return None
@@ -115,4 +109,4 @@ def _measure_motion(first: Features, second: Features) -> _Motion | None:
     right, down = motion
     equations = [[right, 0, 1, 0], [0, right, 0, -1], [down, 0, 0, 1], [0, down, 1, 0]]
     solution, *_ = np.linalg.lstsq(np.array(equations), np.column_stack(slopes).ravel(), rcond=None)
-    return _Motion(float(np.hypot(*motion)), np.asarray(solution[:2]))
+    return float(np.hypot(*motion)), np.asarray(solution[:2])

@@ -17,7 +17,7 @@ from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
 from edgevpr.places.index import choose_places
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.rows import Content, RowError, Values
+from edgevpr.places.rows import Content, RowError
 
 _MAX_FAULTS = 20  # to be listed by SQLite
 _NO_LANDMARKS: Content = {"landmarks": None, "landmarks_crc32": None}
@@ -61,12 +61,8 @@ def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> It
     """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order in
     which the places were added."""
     spec = place_map.spec
-    for place_id, row in place_map.scan_rows(rows.ALL_COLUMNS) if only is None else _read_rows(place_map, only):
-        if row is not None:
-            problem, content = None, rows.read_columns(rows.ALL_COLUMNS, row)
-        else:
-            content = _read_without_landmarks(place_map, place_id)
-            problem = "SQLite cannot read its landmarks" if content else "SQLite cannot read its row"
+    for place_id in [place_id for place_id, _ in place_map.scan_rows("1")] if only is None else sorted(only):
+        content, problem = _read_content(place_map, place_id)
         is_usable = False
         try:
             if content:
@@ -82,19 +78,15 @@ def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> It
         yield PlaceCheck(place_id, problem, content, is_usable)
 
 
-def _read_without_landmarks(place_map: PlaceMap, place_id: int) -> Content:
-    """Return a row without its landmarks, which cannot be read; empty if the rest cannot be read either."""
+def _read_content(place_map: PlaceMap, place_id: int) -> tuple[Content, str | None]:
+    """Return the row of a place, without landmarks that cannot be read, and the problem (None: none). The row is empty
+    if the rest cannot be read either."""
     with suppress(PlaceError):
-        return {**place_map.read_row(place_id, rows.COLUMNS_WITHOUT_LANDMARKS), **_NO_LANDMARKS}
-    return {}
-
-
-def _read_rows(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[int, Values | None]]:
-    for place_id in sorted(place_ids):
-        try:
-            yield place_id, tuple(place_map.read_row(place_id, rows.ALL_COLUMNS).values())
-        except PlaceError:
-            yield place_id, None
+        return place_map.read_row(place_id, rows.ALL_COLUMNS), None
+    with suppress(PlaceError):
+        content = place_map.read_row(place_id, rows.COLUMNS_WITHOUT_LANDMARKS)
+        return {**content, **_NO_LANDMARKS}, "SQLite cannot read its landmarks"
+    return {}, "SQLite cannot read its row"
 
 
 def merge_maps(
@@ -200,11 +192,11 @@ def copy_places(path: str | Path, out: Path, place_ids: Collection[int]) -> int:
         return _copy_usable(place_map, temp_path, check_places(place_map, place_ids))
 
 
-def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = iterate_silently) -> tuple[int, int]:
+def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = iterate_silently) -> int:
     """Copy the `count` best readable places of a map to the new file `out`: those of high quality that leave small gaps
-    (see `choose_places`). They keep their ids, since the calibration, which is copied like the mask hash, refers to
-    them. Returns (number of places copied, number of readable places). Raises MapError, and leaves no partial file, if
-    the map cannot be read, or if `out` exists or cannot be written."""
+    (see `choose_places`); return their number. They keep their ids, since the calibration, which is copied like the
+    mask hash, refers to them. Raises MapError, and leaves no partial file, if the map cannot be read, or if `out`
+    exists or cannot be written."""
     with mapfiles.write_atomically(out) as temp_path, PlaceMap.open(path) as place_map:
         checks = progress(check_places(place_map), len(place_map), "reading")
         places = [rows.parse_place(check.place_id, check.content) for check in checks if check.is_usable]
@@ -213,7 +205,7 @@ def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = ite
         best = choose_places(lat_deg, lon_deg, np.array([_rate_place(place) for place in places]), count)
         place_ids = [places[row].place_id for row in best.tolist()]
         checks = progress(check_places(place_map, place_ids), len(place_ids), "copying")
-        return _copy_usable(place_map, temp_path, checks), len(places)
+        return _copy_usable(place_map, temp_path, checks)
 
 
 def _rate_place(place: Place) -> float:

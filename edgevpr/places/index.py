@@ -76,16 +76,21 @@ def compute_place_bytes(spec: TechniqueSpec) -> int:
     return spec.row.nbytes + _METADATA_BYTES
 
 
-def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, extra_bytes: int = 0) -> PlaceIndex:
+def load_index(
+    place_map: PlaceMap, technique: Technique, budget_bytes: int | None = None, extra_bytes: int = 0
+) -> PlaceIndex:
     """Load the coarse parts of a map, packed by the technique. Return the index of the loaded places.
 
-    If `budget_bytes` is too small for all, only those chosen by `choose_places` are loaded. `extra_bytes` per place are
-    reserved for other arrays that grow with the index (see `sequence`). Places that cannot be read are recorded in
-    `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small for one."""
+    If `budget_bytes` (None: no limit) is too small for all, only those chosen by `choose_places` are loaded.
+    `extra_bytes` per place are reserved for other arrays that grow with the index (see `sequence`). Places that cannot
+    be read are recorded in `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small
+    for one."""
     spec = technique.spec
     places, place_bytes = len(place_map), compute_place_bytes(spec) + extra_bytes
     if not places:
         raise MapError(f"{place_map.path} is empty: add places with `edgevpr map build --append`.")
+    if budget_bytes is None:
+        budget_bytes = places * place_bytes
     if budget_bytes < place_bytes:
         raise MapError(
             f"{place_map.path}: the budget of {budget_bytes} bytes of RAM is too small for one place ({place_bytes}): "

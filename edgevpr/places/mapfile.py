@@ -11,7 +11,6 @@ import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,15 +27,6 @@ _COARSE_COLUMNS = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
 _ATTRIBUTION_SEPARATOR = "; "
 _MAX_DIFFERENT_FRACTION = 0.05  # of the values of two coarse parts of the same picture
 _MAX_RELATIVE_DIFFERENCE = 0.01  # of their norm: far above rounding errors, far below that of two pictures
-
-
-class Footprints(NamedTuple):
-    """The places of a map that have a footprint: `place_ids` int64 (M,), `length_m` float64 (M,) of the ground along a
-    picture's longest side, and `is_surveyed` bool (M,), True if it was cut from an orthophoto."""
-
-    place_ids: Ints
-    length_m: Doubles
-    is_surveyed: Bools
 
 
 class _StoredText:
@@ -178,14 +168,14 @@ class PlaceMap(MapConnection):
         with self._convert_row_errors(place_id):
             return rows.read_landmarks(self.read_row(int(place_id), "landmarks, landmarks_crc32"))
 
-    def read_footprints(self) -> Footprints:
-        """Read the footprints of all places that have one, in insertion order. Raises MapError."""
+    def read_footprints(self) -> tuple[Ints, Doubles, Bools]:
+        """Read the footprints of the places that have one, in insertion order: return the ids, int64 (M,), the lengths
+        of ground along a picture's longest side, float64 (M,) metres, and bool (M,), True for the pictures that were
+        cut from an orthophoto. Raises MapError."""
         places = [(place_id, *row) for place_id, row in self.scan_rows("footprint_m, is_surveyed") if row]
         places = [place for place in places if isinstance(place[1], float) and 0 < place[1] < math.inf]
-        ids, length_m, is_surveyed = zip(*places, strict=True) if places else ((), (), ())
-        return Footprints(
-            np.array(ids, np.int64), np.array(length_m, float), np.array([bool(value) for value in is_surveyed], bool)
-        )
+        table = np.array(places, [("id", np.int64), ("length_m", float), ("is_surveyed", bool)])
+        return table["id"], table["length_m"], table["is_surveyed"]
 
     def select_ids(self, columns: str) -> dict[Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""

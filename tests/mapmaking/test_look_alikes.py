@@ -11,7 +11,6 @@ from walks import make_map, query_meter, walk_over
 from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.techniques import create
@@ -64,10 +63,9 @@ def open_map(path, pictures):
     """A map of these pictures, and what it knows of its look-alikes."""
     frames = [Frame(image=image, name=f"{number}.png", t_mono_s=0.0) for number, image in enumerate(pictures)]
     with PlaceMap.open(make_map(path / "m.gpkg", AHEAD, frames)) as place_map:
-        index, rule = load_index(place_map, AHEAD, 10**7), make_accept_rule(AHEAD, load_config(None).match)
-        near_m = MapSearch(AHEAD, place_map, index, rule, meter=query_meter()).near_m
+        search = MapSearch(place_map, AHEAD, make_accept_rule(AHEAD, load_config(None).match), query_meter())
         described = [(number + 1, AHEAD.encode(image)) for number, image in enumerate(pictures)]
-        yield place_map, measure_look_alikes(AHEAD, place_map, index, near_m, described)
+        yield place_map, measure_look_alikes(search, described)
 
 
 def test_measure_look_alikes_finds_similar_doors_among_single_views(tmp_path):

@@ -16,8 +16,8 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Lens, LevelledImage
 from edgevpr.mapmaking import calibrate as calibrating
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, calibrate, fit_logistic, query_map
 from edgevpr.mapmaking.changes import change_picture
+from edgevpr.mapmaking.look_alikes import MapSearch
 from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.calibration import read_calibration
 from edgevpr.runtime.recognise.confidence import Logistic
@@ -68,16 +68,16 @@ def calibrate_map(place_map, pictures, technique=AHEAD, **more):
 
 
 def test_query_map_queries_each_image_in_three_ways(place_map):
-    index, rule = load_index(place_map, AHEAD, 10**6), make_accept_rule(AHEAD, CONFIG)
+    search = MapSearch(place_map, AHEAD, make_accept_rule(AHEAD, CONFIG), query_meter())
     pictures = [(number + 1, LevelledImage(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
-    answers = list(query_map(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
+    answers = list(query_map(search, [*pictures, (99, pictures[0][1])]))
     assert Counter(each.way for each in answers) == {THERE: 3, LEFT_OUT: 3, MIRRORED: 3}
     assert [each.place_id for each in answers] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert all(each.right for each in answers if each.way == THERE)
     assert not any(each.right for each in answers if each.way != THERE)
-    again = list(query_map(AHEAD, place_map, index, rule, query_meter(), pictures))
+    again = list(query_map(search, pictures))
     assert again == answers
-    assert list(query_map(AHEAD, place_map, index, rule, query_meter(), pictures, seed=1)) != answers
+    assert list(query_map(search, pictures, seed=1)) != answers
 
 
 def test_calibration_is_stored_in_the_map(place_map):

@@ -154,7 +154,7 @@ def test_repair_map_keeps_place_ids_and_metadata(map_path, tmp_path):
         place_map.record_calibration("how sure")
         for owner in ("Survey X", None, "City Y", "Survey X"):
             place_map.add_attribution(owner)
-    assert shrink_map(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
+    assert shrink_map(map_path, tmp_path / "small.gpkg", 4) == 4
     write_sql(map_path, "UPDATE places SET coarse = x'00' WHERE place_id = 2")
     repair_map(map_path)
     with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:

@@ -10,16 +10,15 @@ published data sets by their files:
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.core.geodesy import offset_m
+from edgevpr.core.geodesy import offset_between_m
 from edgevpr.core.text import decode_name
 from edgevpr.frames.images import list_images
 from edgevpr.frames.source import read_tags
@@ -30,6 +29,7 @@ _SCORED_STATUSES = ("ok", "novel")  # statuses of a scored query; novel: its pla
 # Maps the file name of each query, in file order, to the file names of its correct references (none: the query is off
 # the map) and of the ignored ones, where a match counts as neither correct nor wrong. None: the query is not scored.
 GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
+PointsByPath = dict[Path, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,22 +144,19 @@ def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
     )
     if not queries or not references:
         raise UsageError("No positions and no ground truth found: pass --ground-truth, or add a positions.csv.")
-    query_deg, reference_deg = (
-        np.array([(position.lat_deg, position.lon_deg) for position in positions.values()])
+    origin = next(iter(references.values()))
+    queries_m, references_m = (
+        {path: offset_between_m(origin, position) for path, position in positions.items()}
         for positions in (queries, references)
     )
-    query_m, reference_m = (
-        np.transpose(offset_m(*reference_deg[0], *points_deg.T)) for points_deg in (query_deg, reference_deg)
-    )
-    truth = _find_near(list(queries), query_m, list(references), reference_m, within_m)
-    return make_dataset(query_dir, ref_dir, truth, query_dir)
+    return _match_near(query_dir, ref_dir, queries_m, references_m, within_m)
 
 
 def _read_utm_names(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
-    queries, references = list_images(query_dir), list_images(ref_dir)
-    query_m, reference_m = (np.array([_parse_utm_m(path) for path in paths]) for paths in (queries, references))
-    truth = _find_near(queries, query_m, references, reference_m, within_m)
-    return make_dataset(query_dir, ref_dir, truth, query_dir)
+    queries_m, references_m = (
+        {path: _parse_utm_m(path) for path in list_images(folder)} for folder in (query_dir, ref_dir)
+    )
+    return _match_near(query_dir, ref_dir, queries_m, references_m, within_m)
 
 
 def _parse_utm_m(path: Path) -> tuple[float, float]:
@@ -170,15 +167,17 @@ def _parse_utm_m(path: Path) -> tuple[float, float]:
         raise UsageError(f"{path}: its name lacks @EASTING@NORTHING@ in metres: rename or remove the file.") from None
 
 
-def _find_near(
-    queries: Sequence[Path], query_m: Doubles, references: Sequence[Path], reference_m: Doubles, within_m: float
-) -> GroundTruth:
-    """Return the ground truth of queries: references within `within_m` metres are correct. `query_m` and `reference_m`,
-    (N, 2), are metres east and north of a common origin. Raises UsageError if no query has a correct reference."""
-    names, truth = [decode_name(path.name) for path in references], GroundTruth()
-    for path, position_m in zip(queries, query_m, strict=True):
-        near = np.flatnonzero(np.hypot(*(reference_m - position_m).T) <= within_m)
+def _match_near(
+    query_dir: Path, ref_dir: Path, queries_m: PointsByPath, references_m: PointsByPath, within_m: float
+) -> Dataset:
+    """Make a data set in which the references within `within_m` metres of a query are correct. `queries_m` and
+    `references_m` are their positions, metres east and north of a common origin. Raises UsageError if no query has a
+    correct reference."""
+    names, truth = [decode_name(path.name) for path in references_m], GroundTruth()
+    points_m = np.array(list(references_m.values()))
+    for path, query_m in queries_m.items():
+        near = np.flatnonzero(np.hypot(*(points_m - query_m).T) <= within_m)
         truth[decode_name(path.name)] = frozenset(names[index] for index in near), frozenset()
     if not any(answers and answers[0] for answers in truth.values()):
         raise UsageError(f"No query was taken within {within_m:g} m of a reference: pass a larger --within-m.")
-    return truth
+    return make_dataset(query_dir, ref_dir, truth, query_dir)

@@ -27,7 +27,7 @@ from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.pictures import FlightPictures
-from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
+from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.places.sequence import make_sequence_search
@@ -157,7 +157,7 @@ def open_temporary_map(
             encoder = make_encoder(SourceConfig(), pictures, technique)
             finished = finish_map(place_map, encoder, MatchConfig(), pictures, show_progress)
         with PlaceMap.open(path) as place_map:
-            index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
+            index = load_index(place_map, technique)
             # Drop the name of the temporary folder, which is deleted afterwards and differs in every run.
             yield place_map, index, tuple(sentence.replace(f"{folder}/", "") for sentence in finished.not_done)
 
