@@ -27,7 +27,7 @@ from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
 from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, read_prior, summarise
-from edgevpr.lab.evaluate.metrics import add_pcu, read_result
+from edgevpr.lab.evaluate.metrics import add_pcu
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import hash_model_file
@@ -190,7 +190,7 @@ def write_set(path: Path, folder: Path, variants: list[Variant]) -> None:
             "cpu": provenance.read_cpu_model(),
         }
     ordered_rows = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
-    for row, result in zip(ordered_rows, add_pcu(map(read_result, ordered_rows)), strict=True):
+    for row, result in zip(ordered_rows, add_pcu(map(sets_page.read_result, ordered_rows)), strict=True):
         row |= asdict(result)  # PCU depends on the slowest encoder, which may have changed
     run = base.describe_run()
     content = {"set": folder.name, "use": base.find_use(folder.name), "date": run["date"], "machine": run["machine"]}
@@ -234,7 +234,7 @@ def write_accuracy(contents: list[Row]) -> None:
                     "queries": sum(row["queries"] for row in recalls),
                     "asked": sum(row["queries"] for row in results),
                     **{key: sum(row[key] for row in results) for key in ("accepted", "accepted_wrong")},
-                    "accepted_elsewhere": sum(read_result(row).accepted_elsewhere for row in results),
+                    "accepted_elsewhere": sum(sets_page.read_result(row).accepted_elsewhere for row in results),
                 }
     ACCURACY.write_text(json.dumps(accuracy, indent=1) + "\n")
 

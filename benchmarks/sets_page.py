@@ -1,13 +1,14 @@
 """The page `sets.md`, which summarises the result files of the image sets, and its precision-recall curves."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import base
 from base import Row
 
 from edgevpr.lab.evaluate import tables
-from edgevpr.lab.evaluate.metrics import TechniqueResult, read_result
+from edgevpr.lab.evaluate.metrics import Figures, TechniqueResult
 
 Results = Mapping[str, Sequence[TechniqueResult]]  # by the name of the set
 
@@ -67,6 +68,12 @@ def select_match_figures(row: Row) -> Row:
 def has_curve(label: str) -> bool:
     """Return True if the precision-recall curve of a row is drawn."""
     return not label.endswith(_SUFFIXES_WITHOUT_CURVE)
+
+
+def read_result(row: Row) -> TechniqueResult:
+    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are ignored."""
+    values = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
+    return TechniqueResult(**{**values, "with_match": values.get("with_match") and Figures(**values["with_match"])})
 
 
 def write_page(folder: Path, left_out: dict[str, str]) -> None:

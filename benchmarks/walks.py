@@ -13,9 +13,9 @@ from edgevpr.core.config import Config, load_config
 from edgevpr.core.contract import Technique
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
-from edgevpr.frames.source import open_source
+from edgevpr.frames.source import open_source, read_to_end
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import open_temporary_map, read_frames
+from edgevpr.lab.evaluate.evaluate import open_temporary_map
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
@@ -48,7 +48,7 @@ def make_meter() -> QueryMeter:
 
 def read_folder_frames(folder: Path) -> Iterator[Frame]:
     """Yield the pictures of a folder as frames, with their positions."""
-    return read_frames(open_source(str(folder), live=False))
+    return filter(None, read_to_end(open_source(str(folder), live=False)))
 
 
 def make_frame(image: np.ndarray | Path, name: str | None = None, t_s: float = 0.0) -> Frame:

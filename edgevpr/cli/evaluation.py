@@ -16,7 +16,6 @@ from edgevpr.cli.shared import (
     make_config,
     parse_parameters,
     parse_positive,
-    parse_value,
     print_notes,
     print_result,
 )
@@ -53,8 +52,7 @@ def add(commands: Any) -> None:
 
 def run_eval(args: Namespace) -> int:
     """Run `eval`: measure techniques on data sets, and print the results."""
-    from edgevpr.lab.evaluate.evaluate import MatchOptions
-    from edgevpr.lab.evaluate.runs import measure
+    from edgevpr.lab.evaluate.evaluate import MatchOptions, measure
     from edgevpr.lab.evaluate.tables import format_results
 
     config, rows, sets = make_config(args, args.config), _list_rows(args), _open_sets(args)
@@ -100,7 +98,7 @@ def _open_sets(args: Namespace) -> "dict[str, Dataset]":
 
 
 def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
-    """Return the rows requested by the flags, for `runs.measure`: each technique in each form. Raises UsageError for an
+    """Return the rows requested by the flags, for `measure`: each technique in each form. Raises UsageError for an
     unknown form, and for a --param of a technique that is not in --techniques."""
     from edgevpr import techniques
     from edgevpr.runtime.preflight.pick import make_camera_setting
@@ -111,7 +109,8 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
         raise UsageError(f"--form has an unknown value `{unknown[0]}`: choose from {', '.join(FORMS)}.")
-    settings = {name: make_camera_setting(name, parse_value(args, "source.camera")) for name in names}
+    camera = make_config(args).source.camera
+    settings = {name: make_camera_setting(name, camera) for name in names}
     for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:

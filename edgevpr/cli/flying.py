@@ -164,10 +164,9 @@ def _show_findings(findings: "Sequence[Finding]", as_json: bool, **extra_fields:
     return max(finding.exit_code for finding in findings)
 
 
-def run_service_print(args: Namespace) -> int:
+def run_service_print(args: Namespace) -> None:
     """Run `service print`: print the systemd unit for a board."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.service.unit import render_unit
 
     print(render_unit(load_board(args.board)), end="")
-    return 0

@@ -59,8 +59,7 @@ def _run(argv: list[str]) -> int:
     logging.basicConfig(level=logging.DEBUG if args.debug else logging.INFO, handlers=[handler])
     logging.getLogger("edgevpr").setLevel(logging.WARNING if args.quiet else logging.NOTSET)
     try:
-        code: int = args.run(args)
-        return code
+        return int(args.run(args) or 0)
     except EdgevprError as error:
         return _report_failure(args, error, str(error), error.exit_code)
     except BrokenPipeError:  # the reader of the output has exited (`edgevpr ... | head`)

@@ -1,14 +1,14 @@
-"""`edgevpr map`: build, refine, move, calibrate, inspect, check, repair and merge place maps; and `edgevpr salience`:
+"""`edgevpr map`: build, refine, move, calibrate, inspect, check, repair, merge and cut maps; and `edgevpr salience`:
 print how memorable, static and rich in information an image is."""
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli import subset
 from edgevpr.cli.shared import (
+    Run,
     add_command,
     add_group,
     add_json,
@@ -18,6 +18,7 @@ from edgevpr.cli.shared import (
     add_recording,
     check_output,
     describe_lost_calibration,
+    format_fields,
     make_config,
     parse_parameters,
     parse_positive,
@@ -36,13 +37,14 @@ if TYPE_CHECKING:
 
 _ORTHOPHOTO_FLAGS = ("footprint_m", "spacing_m", "area", "attribution")
 _RECORDING_FLAGS = ("positions", "rate_hz")
+_MISSION_MARGIN_M = 500.0
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = add_group(commands, "map", "build, refine, calibrate, inspect, check, repair, merge and cut maps")
 
-    def add_to_map(name: str, run: Callable[[Namespace], int], text: str, map_help: str = "") -> ArgumentParser:
+    def add_to_map(name: str, run: Run, text: str, map_help: str = "") -> ArgumentParser:
         parser = add_command(maps, name, run, text)
         parser.add_argument("map", metavar="MAP", help=map_help or None)
         return parser
@@ -72,7 +74,7 @@ def add(commands: Any) -> None:
     merge.add_argument("out", metavar="OUT", help="map to write")
     merge.add_argument("maps", metavar="MAP", nargs="+")
     add_json(merge)
-    subset.add(add_to_map)
+    _add_subset(add_to_map("subset", run_map_subset, "cut out the part that a mission needs", "map, or folder of maps"))
     salience = add_command(commands, "salience", run_salience, "print how memorable an image is")
     salience.add_argument("image", metavar="IMAGE")
     salience.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
@@ -91,6 +93,25 @@ def _add_build(build: ArgumentParser) -> None:
     build.add_argument("--attribution", metavar="TEXT", help="attribution that the orthophoto's licence requires")
     build.add_argument("--append", action="store_true", help="add to an existing map, or resume an interrupted build")
     add_json(build)
+
+
+def _add_subset(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--mission",
+        metavar="FILE",
+        required=True,
+        help="Mission Planner waypoints, QGroundControl .plan, or LAT,LON,RADIUS_M",
+    )
+    parser.add_argument("--out", metavar="MAP", required=True, help="map to write")
+    parser.add_argument(
+        "--margin-m",
+        type=parse_positive,
+        metavar="M",
+        default=_MISSION_MARGIN_M,
+        help="margin around the mission in metres (default: %(default)g)",
+    )
+    parser.add_argument("--mb", type=parse_positive, metavar="MB", help="maximum file size in MB (default: no limit)")
+    add_json(parser)
 
 
 def _add_pictures(parser: ArgumentParser) -> None:
@@ -172,7 +193,7 @@ def run_map_build(args: Namespace) -> int:
     return report_unusable(unusable)
 
 
-def run_map_refine(args: Namespace) -> int:
+def run_map_refine(args: Namespace) -> None:
     """Run `map refine`: correct the positions of a map's places by matching their pictures, and print the result."""
     from edgevpr.mapmaking.finishing import refine_map
     from edgevpr.places.mapfile import PlaceMap
@@ -181,10 +202,9 @@ def run_map_refine(args: Namespace) -> int:
     with PlaceMap.open_for_writing(args.map) as place_map:
         refined = refine_map(place_map, create_technique(place_map), args.images, progress)
     print_result({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
-    return 0
 
 
-def run_map_move(args: Namespace) -> int:
+def run_map_move(args: Namespace) -> None:
     """Run `map move`: move the places of a map by the offset from GPS that a flight measured, and print the move."""
     from edgevpr.mapmaking.moving import move_map
     from edgevpr.places.mapfile import PlaceMap
@@ -192,10 +212,9 @@ def run_map_move(args: Namespace) -> int:
     with PlaceMap.open_for_writing(args.map) as place_map:
         move = move_map(place_map, args.by)
     print_result({"map": args.map, **asdict(move)}, args.json, format_move(args.map, move))
-    return 0
 
 
-def run_map_calibrate(args: Namespace) -> int:
+def run_map_calibrate(args: Namespace) -> None:
     """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect from the map."""
     from edgevpr.mapmaking.finishing import calibrate_map, make_encoder
     from edgevpr.places.mapfile import PlaceMap
@@ -207,10 +226,9 @@ def run_map_calibrate(args: Namespace) -> int:
         calibration = calibrate_map(place_map, encoder, config.match, pictures, progress)
     fields = {"map": args.map, "calibration": calibration.figures()}
     print_result(fields, args.json, [f"{args.map}: calibrated: {calibration.describe()}"])
-    return 0
 
 
-def run_map_info(args: Namespace) -> int:
+def run_map_info(args: Namespace) -> None:
     """Run `map info`: print what a map contains and its size on disk and in RAM; with --page, make an HTML page too."""
     from edgevpr.places.index import compute_place_bytes
     from edgevpr.places.mapfile import PlaceMap
@@ -233,7 +251,6 @@ def run_map_info(args: Namespace) -> int:
     print_result({**asdict(info), **figures, "ram_mb": ram_mb}, args.json, lines)
     if args.page:
         _write_page(args, lines, calibration.recognisable if calibration else {})
-    return 0
 
 
 def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, float]) -> None:
@@ -271,7 +288,7 @@ def run_map_check(args: Namespace) -> int:
     return 0 if result.is_intact else 1
 
 
-def run_map_repair(args: Namespace) -> int:
+def run_map_repair(args: Namespace) -> None:
     """Run `map repair`: remove the damaged places of a map, and keep the original file."""
     from edgevpr.places.examine import check_map, repair_map
 
@@ -282,10 +299,9 @@ def run_map_repair(args: Namespace) -> int:
     repaired = f"{args.map}: repaired, {result.places} places kept, {dropped} removed; the original is now {original}"
     text = "no damage: the map is unchanged" if original is None else repaired
     print_result(fields, args.json, [*format_check(result), text])
-    return 0
 
 
-def run_map_merge(args: Namespace) -> int:
+def run_map_merge(args: Namespace) -> None:
     """Run `map merge`: merge several maps into one."""
     from edgevpr.places.examine import merge_maps
     from edgevpr.places.mapfiles import parse_map_path
@@ -300,10 +316,22 @@ def run_map_merge(args: Namespace) -> int:
     text.append(f"{args.out}: {merged['places']} places")
     text += describe_lost_calibration(args.out, were_calibrated)
     print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
-    return 0
 
 
-def run_salience(args: Namespace) -> int:
+def run_map_subset(args: Namespace) -> None:
+    """Run `map subset`: cut out the map of a mission, and print what is left out."""
+    from edgevpr.mapmaking.missions import read_area
+    from edgevpr.mapmaking.subset import make_subset
+    from edgevpr.places.mapfiles import parse_map_path
+
+    area, out = read_area(args.mission), parse_map_path(args.out)
+    result = make_subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
+    fields = {"map": str(out), **asdict(result)}
+    text = [*format_fields(fields), *describe_lost_calibration(str(out), result.lost_calibration)]
+    print_result(fields, args.json, text)
+
+
+def run_salience(args: Namespace) -> None:
     """Run `salience`: print the salience scores of a picture (see the glossary)."""
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import open_salience_gate
@@ -314,4 +342,3 @@ def run_salience(args: Namespace) -> int:
     judgement = judge_scores(gate.scores(read_image(Path(args.image))), gate.config)
     outcome = {"kept": judgement.reason is None, "reason": judgement.reason and judgement.reason.fields()}
     print_result({"image": args.image, **asdict(judgement.scores), **outcome}, args.json)
-    return 0

@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     add_json(parser)
 
 
-def run_positions(args: Namespace) -> int:
+def run_positions(args: Namespace) -> None:
     """Run `positions`: write the table of positions that all other commands find next to the pictures."""
     from edgevpr.core.errors import UsageError
     from edgevpr.core.text import show_elapsed
@@ -63,4 +63,3 @@ def run_positions(args: Namespace) -> int:
         "out": str(out),
     }
     print_result(fields, args.json)
-    return 0

@@ -1,6 +1,7 @@
 """`edgevpr profile`: estimate, before take-off, how much RAM and battery each technique needs on a board."""
 
 from argparse import Namespace
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_command, add_json, add_keys, make_config, parse_count, parse_positive, print_result
@@ -30,7 +31,7 @@ def add(commands: Any) -> None:
     add_json(parser)
 
 
-def run_profile(args: Namespace) -> int:
+def run_profile(args: Namespace) -> None:
     """Run `profile`: estimate the cost of techniques in a flight, or list the boards that have a profile."""
     from edgevpr.power.boards import list_boards, load_board, resolve_board
     from edgevpr.runtime.preflight.estimate import estimate_flight
@@ -40,14 +41,13 @@ def run_profile(args: Namespace) -> int:
     if args.list:
         for name in ("this", *list_boards()):
             print(f"{name:<20} {load_board(name).title}")
-        return 0
+        return
     config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
     plan, trials = _make_plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "running techniques")
     estimate = estimate_flight(board, results, plan)
     print_result(estimate, args.json, format_table(estimate))
-    return 0
 
 
 def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
@@ -60,16 +60,14 @@ def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[Flight
     from edgevpr.runtime.preflight.trial import list_trials
 
     places, camera = args.places, config.source.camera
+    settings: dict[str, Mapping[str, Any]]
     if args.map:
         with PlaceMap.open(args.map) as place_map:
             places, spec = len(place_map), place_map.spec
         camera = str(spec.parameters["camera"]) if "camera" in spec.parameters else camera
-        trials = list_trials((spec.name,), settings={spec.name: spec.parameters})
+        settings = {spec.name: spec.parameters}
     else:
-        trials = list_trials(
-            techniques.list_techniques(),
-            settings={name: make_camera_setting(name, camera) for name in techniques.list_techniques()},
-        )
+        settings = {name: make_camera_setting(name, camera) for name in techniques.list_techniques()}
     plan = FlightPlan(
         places=places,
         rate_hz=board.rate_hz,
@@ -79,4 +77,4 @@ def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[Flight
         budget_mb=board.budget_mb,
         camera=camera,
     )
-    return plan, trials
+    return plan, list_trials(tuple(settings), settings)

@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
     add_json(replay)
 
 
-def run_report(args: Namespace) -> int:
+def run_report(args: Namespace) -> None:
     """Run `report`: write the HTML page of a flight."""
     from edgevpr.review.album import make_album, make_map_album
     from edgevpr.review.logged import get_text, read_flight
@@ -57,7 +57,6 @@ def run_report(args: Namespace) -> int:
     page = make_flight_page(flight, ground, frames, references, no_ground)
     write_output(args.out, args.log, page)
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
-    return 0
 
 
 def run_replay(args: Namespace) -> int:

@@ -24,6 +24,7 @@ from edgevpr.core.config import Config, list_keys, load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import sanitize, suggest
 
+Run = Callable[[Namespace], int | None]  # runs a command with its arguments; returns its exit code (None: 0)
 _PREFIX = "key "  # prefix of `Namespace` attributes that hold configuration keys
 _HELP_COLUMNS = 78
 _UNITS = {
@@ -45,9 +46,8 @@ class Parser(ArgumentParser):
         super()._check_value(action, value)
 
 
-def add_command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
-    """Add a command and return its parser. `run` is called with the parsed arguments and returns the exit code; `text`
-    is the command's help."""
+def add_command(commands: Any, name: str, run: Run, text: str) -> ArgumentParser:
+    """Add a command and return its parser. `text` is the command's help."""
     parser = _add_parser(commands, name, text)
     parser.set_defaults(run=run, parser=parser)
     parser.epilog = format_examples(parser.prog.partition(" ")[2])
@@ -126,11 +126,6 @@ def add_keys(parser: ArgumentParser, *names: str) -> None:
         if key.kind is bool:
             form = {"action": "store_const", "const": key.sets}
         parser.add_argument(*key.flags, dest=_PREFIX + key.name, help=key.text, **form)
-
-
-def parse_value(args: Namespace, name: str) -> Any:
-    """Return the value that the flags set for the configuration key `name`; None if they set none."""
-    return getattr(args, _PREFIX + name)
 
 
 def make_config(args: Namespace, path: str | None = None, **overrides: Any) -> Config:

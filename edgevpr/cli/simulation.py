@@ -41,7 +41,7 @@ def _parse_seed(text: str) -> int:
     return int(text)
 
 
-def run_simulate_flight(args: Namespace) -> int:
+def run_simulate_flight(args: Namespace) -> None:
     """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
     if args.orthophoto is None:
         if flags := [name for name in ("track", *_NUMBER_FLAGS) if getattr(args, name) is not None]:
@@ -49,7 +49,7 @@ def run_simulate_flight(args: Namespace) -> int:
         from edgevpr.lab.simulate.generated import write_generated_flight
 
         print(write_generated_flight(Path(args.out), args.which or "map", args.seed))
-        return 0
+        return
     if args.track is None or args.which is not None:
         raise UsageError("A flight over an orthophoto needs --track and does not accept --which.")
     from edgevpr.core.text import progress
@@ -68,12 +68,10 @@ def run_simulate_flight(args: Namespace) -> int:
     print(f"{args.out}: {written} images in images/, their positions in positions.csv")
     if beyond := len(shots) - written:
         print(f"{beyond} images left out: they would show ground beyond the orthophoto")
-    return 0
 
 
-def run_demo(args: Namespace) -> int:
+def run_demo(args: Namespace) -> None:
     """Run `demo`: run the demonstration, and print its summary."""
     from edgevpr.lab.simulate import demo
 
     print(demo.run_demo(Path(args.out)))
-    return 0

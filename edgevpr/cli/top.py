@@ -5,6 +5,7 @@ import sys
 import textwrap
 import time
 from argparse import Namespace
+from contextlib import suppress
 from typing import Any
 
 from edgevpr.cli.shared import add_command, add_json, print_result
@@ -30,7 +31,7 @@ def add(commands: Any) -> None:
     add_json(parser)
 
 
-def run_top(args: Namespace) -> int:
+def run_top(args: Namespace) -> None:
     """Run `top`: show the status of a flight until Ctrl-C; once with --once or if stdout is not a terminal."""
     from edgevpr.runtime.flight.status import read_status
 
@@ -39,8 +40,8 @@ def run_top(args: Namespace) -> int:
         if status is None or status[1] > _STALE_STATUS_S:
             raise EdgevprError(" ".join(_explain_no_flight(args.file)))
         print_result(status[0], args.json, format_status(status[0]))
-        return 0
-    try:
+        return
+    with suppress(KeyboardInterrupt):
         while True:
             status = read_status(args.file)
             lines = format_status(status[0]) if status else list(_explain_no_flight(args.file))
@@ -51,8 +52,6 @@ def run_top(args: Namespace) -> int:
             rows = lines if status else [row for line in lines for row in textwrap.wrap(line, columns - 1)]
             print("\n".join(row[: columns - 1] for row in rows[: height - 1]), flush=True)
             time.sleep(_REFRESH_S)
-    except KeyboardInterrupt:
-        return 0
 
 
 def _explain_no_flight(file: str) -> tuple[str, str]:

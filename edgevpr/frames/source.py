@@ -198,13 +198,16 @@ def open_source(
     return VideoSource(path, step_s or 0.0, clock, only, track=read_track(table) if table else None)
 
 
-def read_to_end(source: Source, on_error: Callable[[ImageError], None]) -> Iterator[Frame | None]:
+def read_to_end(source: Source, on_error: Callable[[ImageError], None] | None = None) -> Iterator[Frame | None]:
     """Yield all frames of a recording, and close it at the end. For an image that cannot be used, `on_error` is called
-    with the error and None is yielded. None is also yielded if reading the next frame takes longer than a second."""
+    with the error (None: the error is raised) and None is yielded. None is also yielded if reading the next frame takes
+    longer than a second."""
     while not source.ended:
         try:
             yield source.read(_READ_TIMEOUT_S)
         except ImageError as error:
+            if on_error is None:
+                raise
             on_error(error)
             yield None
     source.close()

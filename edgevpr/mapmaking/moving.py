@@ -2,7 +2,7 @@
 lines of kind "survey" to the flight log). The command `edgevpr map move` calls it.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
             identity = line.get("map_identity")
         elif line["kind"] == "survey":
             survey = line
-    if identity != asdict(read_identity(place_map)):
+    if identity != read_identity(place_map):
         raise UsageError(
             f"{log} was not recorded with the current {place_map.path} (it is from another map, or this map has since "
             "been changed or moved). Pass the log of a flight with this map."

@@ -30,10 +30,10 @@ _MAX_RELATIVE_DIFFERENCE = 0.01  # of their norm: far above rounding errors, far
 
 
 class _StoredText:
-    """A text in the table edgevpr_map; None if there is none, or if it cannot be read."""
+    """A text in the table edgevpr_map, under the name of the attribute; None if it is missing or cannot be read."""
 
-    def __init__(self, key: str) -> None:
-        self._key = key
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._key = name
 
     def __get__(self, place_map: "PlaceMap", owner: type) -> str | None:
         with translate_errors(place_map.path):
@@ -57,10 +57,10 @@ class PlaceMap(MapConnection):
     used to undistort their pictures. `attribution`: attribution texts of the orthophotos from which places were cut.
     `calibration`: the calibration of confidences (see `mapmaking.calibrate`). Each is None if absent or unknown."""
 
-    mask_sha256 = _StoredText(mapspec.MASK)
-    lens = _StoredText(mapspec.LENS)
-    attribution = _StoredText(mapspec.ATTRIBUTION)
-    calibration = _StoredText(mapspec.CALIBRATION)
+    mask_sha256 = _StoredText()
+    lens = _StoredText()
+    attribution = _StoredText()
+    calibration = _StoredText()
 
     def require_technique(self, spec: TechniqueSpec) -> None:
         """Raise MapError, listing the differences, unless the map's descriptors were made by exactly `spec`."""
@@ -106,23 +106,23 @@ class PlaceMap(MapConnection):
 
     def record_mask(self, sha256: str | None) -> None:
         """Store the SHA-256 of the overlay mask that is used to make the places (None: no mask). Raises MapError."""
-        self._record_text(mapspec.MASK, sha256)
+        self._record_text("mask_sha256", sha256)
 
     def record_lens(self, path: str | None) -> None:
         """Store the name of the camera calibration used to undistort the pictures of the places. None: store nothing.
         Raises MapError."""
         if path is not None:
-            self._record_text(mapspec.LENS, Path(path).name)
+            self._record_text("lens", Path(path).name)
 
     def add_attribution(self, text: str | None) -> None:
         """Add an attribution text to the stored ones (None: store nothing). Raises MapError."""
         if text:
             texts = [*(self.attribution or text).split(_ATTRIBUTION_SEPARATOR), *text.split(_ATTRIBUTION_SEPARATOR)]
-            self._record_text(mapspec.ATTRIBUTION, _ATTRIBUTION_SEPARATOR.join(dict.fromkeys(texts)))
+            self._record_text("attribution", _ATTRIBUTION_SEPARATOR.join(dict.fromkeys(texts)))
 
     def record_calibration(self, text: str | None) -> None:
         """Store the map's calibration of confidences, as text (None: not calibrated). Raises MapError."""
-        self._record_text(mapspec.CALIBRATION, text)
+        self._record_text("calibration", text)
 
     def read_places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield the places `place_ids`, in that order (None: all places, in the order in which they were added). Raises

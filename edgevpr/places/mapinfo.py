@@ -4,6 +4,7 @@ import hashlib
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -65,17 +66,6 @@ class MapInfo:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class MapIdentity:
-    """Identity of a map: equal for all copies of its file, different as soon as one place differs. `map_id`: random id
-    from its creation (None: the file has none). `places`: their number. `sha256` covers all places (positions, poses,
-    picture names, checksums of larger values) and the table edgevpr_map with the calibration."""
-
-    map_id: str | None
-    places: int
-    sha256: str
-
-
 def describe_map(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with translate_errors(place_map.path):
@@ -128,8 +118,11 @@ def _find_one_way_deg(place_map: PlaceMap) -> float | None:
     return math.degrees(math.atan2(mean.real, mean.imag)) % 360 if abs(mean) >= _MIN_COURSE_LENGTH else None
 
 
-def read_identity(place_map: PlaceMap) -> MapIdentity:
-    """Return the current identity of an open map. Raises MapError if the map cannot be read.
+def read_identity(place_map: PlaceMap) -> dict[str, Any]:
+    """Return the identity of an open map: equal for all copies of its file, different as soon as one place differs.
+    `map_id`: random id from its creation (None: the file has none). `places`: their number. `sha256` covers all places
+    (positions, poses, picture names, checksums of larger values) and the table edgevpr_map with the calibration.
+    Raises MapError if the map cannot be read.
 
     Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors precede
     them in the file, so they are read quickly, and change whenever a descriptor changes.
@@ -142,12 +135,11 @@ def read_identity(place_map: PlaceMap) -> MapIdentity:
         digest.update(repr(place).encode("utf-8", "backslashreplace"))
         places += 1
     map_id = place_map.stored.get("map_id")
-    return MapIdentity(map_id if isinstance(map_id, str) else None, places, digest.hexdigest())
+    return {"map_id": map_id if isinstance(map_id, str) else None, "places": places, "sha256": digest.hexdigest()}
 
 
 def find_inconsistent_tags(shift_m: Floats) -> Bools:
     """Return bool (N,), True for places whose recorded position is more than four standard deviations per axis from the
     refined one. `shift_m`, float (N,): metres between the two; their median sets the standard deviation."""
     limit_m = max(_MIN_TAG_ERROR_M, _MAX_SIGMA * float(np.median(shift_m)) / _RAYLEIGH_MEDIAN) if len(shift_m) else 0.0
-    is_inconsistent: Bools = shift_m > limit_m
-    return is_inconsistent
+    return shift_m > limit_m

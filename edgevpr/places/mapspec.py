@@ -20,12 +20,7 @@ _PRERELEASE_VERSION = 4  # format version in maps made before the first release;
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MAX_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
-# Keys of optional texts.
-MASK = "mask_sha256"
-LENS = "lens"
-ATTRIBUTION = "attribution"
-CALIBRATION = "calibration"
-OPTIONAL_KEYS = (MASK, LENS, ATTRIBUTION, CALIBRATION)
+_OPTIONAL_KEYS = ("mask_sha256", "lens", "attribution", "calibration")  # of texts, which `PlaceMap` reads
 _MAX_STORED = 1000  # rows read from the table, and characters of a damaged value in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
@@ -47,7 +42,7 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
-    """Return the values of edgevpr_map by key, without `OPTIONAL_KEYS`, and check the columns of `places`. Raises
+    """Return the values of edgevpr_map by key, without `_OPTIONAL_KEYS`, and check the columns of `places`. Raises
     MapError for a file that is not a place map or has an unknown format version, and sqlite3.Error."""
     (application_id,) = db.execute("PRAGMA application_id").fetchone()
     # A view or virtual table, which has no page of its own in the file, is rejected: a query of it may never end.
@@ -56,7 +51,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
         raise MapError(f"{path}: this is not a place map: use a .gpkg file made by `edgevpr map build`.")
     try:
         # The optional keys are read only when needed: a map can be used without them.
-        entries = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", OPTIONAL_KEYS)
+        entries = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", _OPTIONAL_KEYS)
         stored = {key: json.loads(value) for key, value in entries.fetchmany(_MAX_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:

@@ -112,12 +112,11 @@ def _make_steps(
         }
         sd_m = float(np.sqrt(sum(pose.covariance_m2[::2]) / 2)) if pose else None
         texts = [f"quality {place.quality:.2f}: usable fraction of its image"]
-        texts += (
-            [f"position accurate to {format_number(sd_m, 'm')}; its image shows {pose.footprint_m:.3g} m of ground"]
-            if pose
-            else []
-        )
-        texts += [f"its GPS tag is {tags_off_m[place_id]:.0f} m from its image"] if place_id in tags_off_m else []
+        if pose:
+            accuracy = f"position accurate to {format_number(sd_m, 'm')}"
+            texts.append(f"{accuracy}; its image shows {pose.footprint_m:.3g} m of ground")
+        if place_id in tags_off_m:
+            texts.append(f"its GPS tag is {tags_off_m[place_id]:.0f} m from its image")
         if confidence is not None:
             texts.append(f"mean confidence of altered copies of its image: {format_probability(confidence)}")
         pictures = [("place", place.source_image, f"place {place_id}: {place.source_image}")]

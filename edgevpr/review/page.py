@@ -24,9 +24,9 @@ from edgevpr.review.logged import (
 from edgevpr.review.webpage import (
     UNKNOWN,
     Chart,
-    Form,
     Layer,
     Section,
+    Series,
     Step,
     format_duration,
     format_number,
@@ -206,13 +206,11 @@ def _list_warnings(flight: LoggedFlight, has_map_places: bool, no_places: str) -
 
 
 def _make_charts(flight: LoggedFlight) -> list[Chart]:
-    def make_line(name: str, colour: str, scale: float, *keys: str) -> tuple[str, str, Form, list[tuple[float, float]]]:
+    def make_line(name: str, colour: str, scale: float, *keys: str) -> Series:
         values = [(query.t_s, get_number(query.line, *keys)) for query in flight.queries]
         return name, colour, "line", [(t_s, scale * value) for t_s, value in values if value is not None]
 
-    def make_dots(
-        name: str, colour: str, values: Sequence[float | None]
-    ) -> tuple[str, str, Form, list[tuple[float, float]]]:
+    def make_dots(name: str, colour: str, values: Sequence[float | None]) -> Series:
         pairs = zip(flight.queries, values, strict=True)
         return name, colour, "dots", [(query.t_s, value) for query, value in pairs if value is not None]
 

@@ -1,8 +1,7 @@
 """Replays a recorded flight, for `edgevpr replay`: runs its code with clocks, frames and messages of the recording."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -81,11 +80,15 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             status=None,
             recording=header["recording"],
         )
+        # Of the replayed flight, only errors are logged (with --debug: all messages).
+        logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
         try:
-            with _silence_log(), closing(Flight.open(config, io)) as flight:
+            with closing(Flight.open(config, io)) as flight:
                 flight.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
+        finally:
+            logging.disable(logging.NOTSET)
         show_progress("")
         return ReplayResult(
             flown=flown,
@@ -94,16 +97,6 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             why_ended=why_ended,
             guessed=playback.guessed,
         )
-
-
-@contextmanager
-def _silence_log() -> Iterator[None]:
-    """Context manager that suppresses messages of the replayed flight except errors (with --debug: none)."""
-    logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 def _read_frame(folder: Path, number: int) -> Image:

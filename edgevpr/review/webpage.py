@@ -22,6 +22,8 @@ from edgevpr.review.album import Album, AlbumPicture, embed_pictures
 from edgevpr.review.logged import Point
 
 Form = Literal["dots", "line", "area"]
+# The name in the legend, the colour, the form ("dots" are not joined) and the points (t_s, value) of values in a chart.
+Series = tuple[str, str, Form, Sequence[tuple[float, float]]]
 
 UNKNOWN = "–"
 MAX_PAGE_BYTES = 15_000_000
@@ -78,12 +80,11 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart over time of values in `unit` ("": fractions, 0..1). `series`: for each, the name in the legend, the
-    colour, the form ("dots" are not joined) and the points (t_s, value)."""
+    """A chart over time of values in `unit` ("": fractions, 0..1)."""
 
     title: str
     unit: str
-    series: Sequence[tuple[str, str, Form, Sequence[tuple[float, float]]]]
+    series: Sequence[Series]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """`edgevpr map move`: a map is moved by the offset and the scale that a flight with it has found, or not at all."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def write_flight_log(path, *lines):
     """The log of a flight with the map, as it is now."""
     log = path.with_name("flight.jsonl")
     with PlaceMap.open(path) as place_map:
-        start = {"kind": "start", "time": "now", "t_mono_s": 0.0, "map_identity": asdict(read_identity(place_map))}
+        start = {"kind": "start", "time": "now", "t_mono_s": 0.0, "map_identity": read_identity(place_map)}
     log.write_text("".join(json.dumps(line) + "\n" for line in (start, *lines)))
     return log
 

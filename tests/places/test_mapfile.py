@@ -260,10 +260,10 @@ def identity(map_path):
 def test_read_identity_is_equal_for_a_copy_until_a_change(map_path, tmp_path, change):
     before = identity(map_path)
     assert identity(shutil.copy(map_path, tmp_path / "copy.gpkg")) == before
-    assert (before.places, len(before.map_id)) == (10, 32)
+    assert (before["places"], len(before["map_id"])) == (10, 32)
     with contextlib.closing(connect(map_path, "rw")) as db:
         db.execute(change)
-    assert identity(map_path).sha256 != before.sha256
+    assert identity(map_path)["sha256"] != before["sha256"]
 
 
 @pytest.mark.parametrize(

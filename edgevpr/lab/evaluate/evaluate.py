@@ -1,4 +1,5 @@
-"""Measures a technique on a data set: maps the references, runs queries as in flight, judges and sums up the answers.
+"""Measures techniques on data sets for `edgevpr eval`: maps the references, runs queries as in flight, judges and sums
+up the answers.
 
 Numbers in parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Place Recognition for
 Autonomous Robots*).
@@ -6,24 +7,25 @@ Autonomous Robots*).
 
 import math
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig
+from edgevpr.core.config import BatteryConfig, MatchConfig, SalienceConfig, SourceConfig
 from edgevpr.core.contract import Technique, TechniqueSpec
-from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.core.errors import EdgevprError, ImageError, ModelError, UsageError
 from edgevpr.core.text import Progress, iterate_silently
 from edgevpr.core.types import NO_COST, Frame, StageCost
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.positions import GeoTag
-from edgevpr.frames.source import Source, open_source, read_tags
+from edgevpr.frames.source import open_source, read_tags, read_to_end
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
+from edgevpr.lab.evaluate.provenance import describe_origin
 from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.pictures import FlightPictures
@@ -40,11 +42,12 @@ from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.hints import RecordedPrior, explain_why_unusable, parse_known_fields
 from edgevpr.runtime.recognise.judge import make_accept_rule
+from edgevpr.runtime.recognise.opening import open_salience_gate
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import SalienceGate
-from edgevpr.techniques import format_name
+from edgevpr.techniques import create, format_name
 from edgevpr.techniques.card import describe_weights
 
 _NO_TAG = GeoTag()
@@ -102,7 +105,8 @@ def answer_queries(
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
     sequence = options.sequence or spec.sequence
     source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
-    frames = progress(read_frames(source), source.total, f"{spec.name}: references")
+    # An unusable image raises ImageError, because figures that omit images would mislead.
+    frames = filter(None, progress(read_to_end(source), source.total, f"{spec.name}: references"))
     with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
         rule = make_accept_rule(technique, MatchConfig(), sequence, read_calibration_for(place_map))
         tracks_flight = options.follow and sequence == 1 and rule.confidence_rule is not None
@@ -273,9 +277,60 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
     )
 
 
-def read_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a source. Raises ImageError for the first that cannot be used, because figures that omit
-    images would mislead."""
-    while not source.ended:
-        if frame := source.read(timeout_s=1.0):
-            yield frame
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """Outcome of a run. `measured`: results of the rows, by set. `answers`: judged answers to their queries, by set and
+    label. `failed`: errors of rows that could not be measured, by set and label."""
+
+    measured: dict[str, list[metrics.TechniqueResult]]
+    answers: dict[tuple[str, str], Sequence[QueryAnswer]]
+    failed: dict[tuple[str, str], EdgevprError]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all results and answers, with date, machine and versions, for `json.dumps`."""
+        results = [(name, result) for name, results in self.measured.items() for result in results]
+        return {
+            **describe_origin(),
+            "results": [
+                {
+                    "set": name,
+                    "row": result.technique,
+                    **asdict(result),
+                    "answers": list(map(_serialise_answer, self.answers[name, result.technique])),
+                }
+                for name, result in results
+            ],
+            "failed": [{"set": name, "row": row, "why": str(error)} for (name, row), error in self.failed.items()],
+        }
+
+
+def _serialise_answer(answer: QueryAnswer) -> dict[str, Any]:
+    """Return the fields of an answer for JSON, with null in place of infinite values."""
+    fields = asdict(answer)
+    return fields | {name: None for name in ("score", "first_right") if not math.isfinite(fields[name])}
+
+
+def measure(
+    sets: Mapping[str, Dataset],
+    rows: Mapping[str, tuple[str, dict[str, Any]]],
+    options: MatchOptions,
+    salience: SalienceConfig,
+    progress: Progress,
+) -> Measurements:
+    """Measure every row on every set. `sets`: data sets by name. `rows`: (technique, settings) by label. Raises
+    UsageError for an unknown technique or parameter. If a network or picture cannot be used, only its row fails."""
+    outcome = Measurements({}, {}, {})
+    for name, dataset in sets.items():
+        results = []
+        for label, (technique_name, settings) in rows.items():
+            technique, gate = create(technique_name, settings), open_salience_gate(salience)
+            try:
+                answers, not_done = answer_queries(technique, dataset, options, progress, gate)
+            except (ModelError, ImageError) as error:  # the other rows continue
+                outcome.failed[name, label] = error
+            else:
+                result = summarise(technique, dataset, answers, options, not_done)
+                results.append(replace(result, technique=label))
+                outcome.answers[name, label] = answers
+        outcome.measured[name] = metrics.add_pcu(results)
+    return outcome

@@ -194,9 +194,3 @@ def add_pcu(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
     return [
         replace(result, pcu=pcu(result.precision_at_100_recall, result.t_encode_s, slowest_s)) for result in results
     ]
-
-
-def read_result(row: dict[str, Any]) -> TechniqueResult:
-    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are ignored."""
-    values = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
-    return TechniqueResult(**{**values, "with_match": values.get("with_match") and Figures(**values["with_match"])})

@@ -151,5 +151,4 @@ def make_oscillation(rng: np.random.Generator, count: int) -> Doubles:
     """Make a slow random oscillation between -1 and 1, float64 (count,)."""
     t = np.arange(count)[:, None] / 9
     waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))
-    swing: Doubles = waves @ (0.75, 0.25)
-    return swing
+    return waves @ (0.75, 0.25)

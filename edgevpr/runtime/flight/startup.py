@@ -18,7 +18,7 @@ from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import MapIdentity, read_identity
+from edgevpr.places.mapinfo import read_identity
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.pick import explain_technique
@@ -113,7 +113,7 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
     }
 
 
-def _identify_map(place_map: PlaceMap) -> MapIdentity | None:
+def _identify_map(place_map: PlaceMap) -> dict[str, Any] | None:
     """Return the identity of a map; None if it cannot be identified."""
     try:
         return read_identity(place_map)

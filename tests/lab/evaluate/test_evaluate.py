@@ -1,8 +1,5 @@
 """The whole measurement on a small generated set."""
 
-import json
-from dataclasses import asdict
-
 import cv2
 import pytest
 from generated_sets import make_set
@@ -12,7 +9,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.text import iterate_silently
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, summarise
-from edgevpr.lab.evaluate.metrics import add_pcu, read_result
+from edgevpr.lab.evaluate.metrics import add_pcu
 from edgevpr.lab.evaluate.tables import format_results
 from edgevpr.mapmaking import finishing
 from edgevpr.runtime.preflight.probe import measure_costs
@@ -84,12 +81,6 @@ def test_evaluate_reports_failed_steps_of_the_map(folder, monkeypatch):
     assert "no SciPy" in note
     assert note in format_results(add_pcu([result]))
     assert evaluate(folder, "hog", HOG).not_done == (), "it has no confidence to calibrate"
-
-
-def test_read_result_gives_the_same_tables_from_json(folder):
-    (result,) = add_pcu([evaluate(folder, "hog", HOG)])
-    read_back = json.loads(json.dumps(asdict(result), allow_nan=False))
-    assert format_results([read_result({**read_back, "other": 1})]) == format_results([result])
 
 
 @pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir", "w1": 208})])
