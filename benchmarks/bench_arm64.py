@@ -22,7 +22,7 @@ from arm64 import counted
 from big_map import make_big_map
 
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.instructions import COUNTED_PATH
+from edgevpr.runtime.preflight.estimate import COUNTED_PATH
 from edgevpr.techniques import create
 
 HERE = Path(__file__).resolve().parent

@@ -14,7 +14,7 @@ import thesis_page
 import thesis_values
 from arm64 import counted
 
-from edgevpr.runtime.preflight.instructions import COUNTED_PATH
+from edgevpr.runtime.preflight.estimate import COUNTED_PATH
 
 BENCHMARKS = Path(base.__file__).parent
 PAGES = {

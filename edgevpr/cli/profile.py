@@ -10,7 +10,7 @@ from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
     from edgevpr.power.boards import Board
-    from edgevpr.runtime.preflight.estimate import FlightPlan
+    from edgevpr.runtime.preflight.choose import FlightPlan
     from edgevpr.runtime.preflight.trial import Trial
 
 
@@ -55,7 +55,7 @@ def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[Flight
     from edgevpr import techniques
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack
-    from edgevpr.runtime.preflight.estimate import FlightPlan
+    from edgevpr.runtime.preflight.choose import FlightPlan
     from edgevpr.runtime.preflight.pick import make_camera_setting
     from edgevpr.runtime.preflight.trial import list_trials
 

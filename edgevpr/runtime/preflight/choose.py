@@ -18,6 +18,7 @@ from typing import Any
 
 from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.power.boards import Board
+from edgevpr.power.equations import Pack
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
@@ -56,17 +57,18 @@ class Accuracy:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Demand:
-    """Requirements of a flight: number of places in RAM, queries per second, MB of RAM for the map's index, and camera
-    direction ("nadir" or "forward"; None: forward)."""
+class FlightPlan:
+    """Plan of a flight: number of places in RAM, queries per second, MB of RAM for the map's index, camera direction
+    ("nadir" or "forward"; None: forward), flight time in minutes, the aircraft's battery, and the fraction of its
+    energy that reaches the board, 0..1."""
 
     places: int
     rate_hz: float
     budget_mb: float
     camera: str | None = None
-
-    def __str__(self) -> str:
-        return f"{self.places} places"
+    flight_min: float
+    pack: Pack
+    regulator_efficiency: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +108,7 @@ class Option:
         return None
 
 
-def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Option:
+def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, plan: FlightPlan) -> Option:
     """Make the option of the technique `name` and check whether it fits the board: its index within the RAM budget of
     the map, its process within the board's memory, and its queries within the CPU time. `label`: technique and form.
     `costs`: costs on `board`.
@@ -114,17 +116,17 @@ def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, dema
     A query must end before the next one begins, and before its fix is too old to send. Queries may use the
     fraction `cpu_share` of all cores.
     """
-    map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
+    map_ram_mb = costs.ram_bytes_per_place * plan.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
-    query = costs.encode + costs.match(demand.places)
+    query = costs.encode + costs.match(plan.places)
     reachable_hz = min(1 / query.wall_s, board.cores * board.cpu_share / query.cpu_s)
     shortfalls = []
-    if map_ram_mb > demand.budget_mb:
-        shortfalls.append(f"its map needs {map_ram_mb:.1f} MB of RAM ({demand.budget_mb:.1f} MB allowed)")
+    if map_ram_mb > plan.budget_mb:
+        shortfalls.append(f"its map needs {map_ram_mb:.1f} MB of RAM ({plan.budget_mb:.1f} MB allowed)")
     if process_ram_mb > board.memory_max_mb:
         shortfalls.append(f"the process needs {process_ram_mb:.0f} MB ({board.memory_max_mb:.0f} MB allowed)")
-    if reachable_hz < demand.rate_hz:
-        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz ({demand.rate_hz:g} Hz needed)")
+    if reachable_hz < plan.rate_hz:
+        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz ({plan.rate_hz:g} Hz needed)")
     if query.wall_s > MAX_FIX_AGE_S:
         limit = f"fixes from frames older than {MAX_FIX_AGE_S:g} s are never sent"
         shortfalls.append(f"a query takes {query.wall_s:.1f} s, but {limit}")
@@ -132,11 +134,11 @@ def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, dema
         label=label,
         name=name,
         costs=costs,
-        accuracy=find_accuracy(label, demand.camera),
+        accuracy=find_accuracy(label, plan.camera),
         t_query_s=query.wall_s,
         cpu_s=query.cpu_s,
         map_ram_mb=map_ram_mb,
-        map_disk_mb=costs.disk_bytes_per_place * demand.places / 1e6,
+        map_disk_mb=costs.disk_bytes_per_place * plan.places / 1e6,
         process_ram_mb=process_ram_mb,
         reachable_hz=reachable_hz,
         misfit=f"does not fit: {' and '.join(shortfalls)}" if shortfalls else None,

@@ -1,32 +1,25 @@
 """Estimates a flight before take-off, for `edgevpr profile`: memory, time, charge and accuracy of each technique
-on a board. They are measured if the board is this machine, else computed from instruction counts (see `instructions`).
+on a board. They are measured if the board is this machine. On another ARM board, the times of `cohog` are computed from
+instruction counts; the costs of other techniques, and on other boards, are known only on the board itself.
 
 `dataclasses.asdict` of a FlightEstimate can be written as JSON.
 """
 
+import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from edgevpr.core.types import QueryCost
+from edgevpr.core.types import QueryCost, StageCost
 from edgevpr.power.boards import Board
-from edgevpr.power.equations import Pack, pack_ah, queries_ah
+from edgevpr.power.equations import pack_ah, queries_ah
 from edgevpr.power.meter import compute_query_cost
-from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, make_option
-from edgevpr.runtime.preflight.instructions import compute_costs, count_work, explain_unknown_costs
+from edgevpr.runtime.preflight.choose import FlightPlan, Option, choose_best, explain_no_choice, make_option
+from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlightPlan(Demand):
-    """Plan of a flight: its requirements (`Demand`), and the inputs of its energy budget.
-
-    `flight_min`: flight time in minutes. `pack`: the aircraft's battery. `regulator_efficiency`: fraction of the pack's
-    energy that reaches the board, 0..1.
-    """
-
-    flight_min: float
-    pack: Pack
-    regulator_efficiency: float
+COUNTED_PATH = Path(__file__).with_name("counted.json")
+_COUNTED = {"w1": 512, "w2": 16, "bins": 8, "entropy": "shannon", "matching": "displacement"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +69,7 @@ def estimate_flight(board: Board, trials: Iterable[Trial], plan: FlightPlan) -> 
     unknown: list[str] = []
     for trial in trials:
         if trial.costs:
-            work = count_work(trial.name, trial.parameters)
-            costs = trial.costs if is_measured else compute_costs(trial.costs, board, work)
+            costs = trial.costs if is_measured else compute_counted_costs(trial, board)
             if costs is None:
                 unknown.append(trial.label)
             else:
@@ -97,6 +89,19 @@ def estimate_flight(board: Board, trials: Iterable[Trial], plan: FlightPlan) -> 
         notes=(*weights, *_list_notes(board, times, unknown)),
         unusable={trial.label: trial.problem for trial in trials if trial.problem},
     )
+
+
+def compute_counted_costs(trial: Trial, board: Board) -> TechniqueCosts | None:
+    """Return the costs of a trial on this machine, with the times of one core of another `board`: the instruction
+    counts of `make bench-arm64`, which are for an ARM core and unaffected by other programs, divided by the board's
+    `arm64_mips`. Memory is not converted. None if the instructions were not counted, or that speed is unknown."""
+    settings, mips = trial.parameters, board.benchmark_score.arm64_mips
+    is_counted = trial.name == "cohog" and all(settings.get(key, value) == value for key, value in _COUNTED.items())
+    if trial.costs is None or mips is None or not is_counted:
+        return None
+    work: dict[str, float] = json.loads(COUNTED_PATH.read_text("utf-8"))[settings.get("camera", "forward")]
+    times = {stage: StageCost(count / (1e6 * mips), count / (1e6 * mips)) for stage, count in work.items()}
+    return replace(trial.costs, **times)  # type: ignore[arg-type]  # all are fields of TechniqueCosts
 
 
 def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
@@ -123,7 +128,7 @@ def _recommend(
     """Return `recommended` and `reason` as in `FlightEstimate`, given its `unknown`."""
     options = [row.option for row in rows]
     if unknown and not options:
-        return None, f"None: the cost of every technique is {explain_unknown_costs(board)}."
+        return None, f"None: the cost of every technique is {_explain_unknown_costs(board)}."
     if not options:
         return None, "None: no technique can be used on this machine."
     best = choose_best(options)
@@ -148,6 +153,11 @@ def _list_notes(board: Board, timing_method: str, unknown: list[str]) -> Iterato
             f"{score.arm64_mips:g} million instructions per second ({unverified}{score.source})."
         )
     if unknown:
-        yield f"The costs of {', '.join(unknown)} are {explain_unknown_costs(board)}."
+        yield f"The costs of {', '.join(unknown)} are {_explain_unknown_costs(board)}."
     if not board.verified:
         yield f"The power of {board.title} is unverified: {board.source}."
+
+
+def _explain_unknown_costs(board: Board) -> str:
+    """Return why costs on `board` are unknown, and what to do, to follow "the cost is"."""
+    return f"unknown on {board.title}: run `edgevpr profile` on the board itself"

@@ -14,7 +14,7 @@ def format_table(estimate: FlightEstimate) -> str:
     not fit or are unusable, and notes."""
     plan, rows = estimate.plan, estimate.techniques
     heading = (
-        f"{estimate.title}: {plan}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
+        f"{estimate.title}: {plan.places} places, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times {estimate.times}"
     )
     others = [*([name, "?"] for name in estimate.unknown), *([name, "n/a"] for name in estimate.unusable)]

@@ -13,10 +13,11 @@ from example_costs import REGIONS, VECTOR, make_accuracy
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
+from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight.choose import (
-    Demand,
+    FlightPlan,
     choose_best,
     explain_no_choice,
     find_accuracy,
@@ -36,13 +37,18 @@ def accuracies(monkeypatch):
     return table
 
 
+def make_plan(places, rate_hz=1.0):
+    battery = {"flight_min": 20.0, "pack": parse_pack("4S5200"), "regulator_efficiency": 0.85}
+    return FlightPlan(places=places, rate_hz=rate_hz, budget_mb=100, **battery)
+
+
 def make_options(board, costs, places):
-    demand = Demand(places=places, rate_hz=1.0, budget_mb=100)
-    return [make_option(board, name, name, cost, demand) for name, cost in costs.items()]
+    plan = make_plan(places)
+    return [make_option(board, name, name, cost, plan) for name, cost in costs.items()]
 
 
 def fit(board, costs, places, rate_hz=1.0):
-    return make_option(board, "regions", "regions", costs, Demand(places=places, rate_hz=rate_hz, budget_mb=100))
+    return make_option(board, "regions", "regions", costs, make_plan(places, rate_hz))
 
 
 def choose_label(board, costs, places):

@@ -1,6 +1,8 @@
 """What is said before take-off: the figures by hand, the notes that must not be missing."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from example_costs import REGIONS, make_accuracy
@@ -10,7 +12,8 @@ from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight import choose
-from edgevpr.runtime.preflight.estimate import FlightPlan, estimate_flight
+from edgevpr.runtime.preflight.choose import FlightPlan
+from edgevpr.runtime.preflight.estimate import compute_counted_costs, estimate_flight
 from edgevpr.runtime.preflight.trial import Trial
 
 VECTOR = replace(ONE_CORE_VECTOR, encode=StageCost(0.05, 0.1), match_per_place=StageCost(0.001, 0.002))
@@ -19,6 +22,7 @@ PLAN = FlightPlan(
     places=100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
 PI = load_board("rpi-4b")
+COUNTED = replace(REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 
 
 @pytest.fixture(autouse=True)
@@ -109,3 +113,31 @@ def test_estimate_recommends_the_most_accurate_that_fits_with_the_reason():
     assert estimated.reason.startswith("cohog: ")
     assert "recall@1 0.90 on 2 image sets" in estimated.reason
     assert estimate({"netvlad": VECTOR}).recommended is None
+
+
+def count_costs(name, board=PI, **parameters):
+    trial = Trial(label=name, name=name, settings={}, costs=COUNTED, parameters=parameters)
+    return compute_counted_costs(trial, board)
+
+
+def test_compute_counted_costs_scales_instructions_but_not_memory():
+    there = count_costs("cohog", camera="nadir")
+    parts, rate_hz = read_instructions(), 1e6 * PI.benchmark_score.arm64_mips
+    assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
+    query_s = there.encode.wall_s + replace(there, candidates=30).match(10_000).wall_s
+    landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]
+    assert query_s == pytest.approx((parts["down: a query"] + landmarks) / rate_hz, rel=1e-3)
+    assert (there.ram_bytes_per_place, there.process_mb) == (1_000, 90.0)
+
+
+def test_compute_counted_costs_is_none_for_other_techniques_settings_and_processors():
+    assert count_costs("cohog") == count_costs("cohog", camera="forward", w1=512, gt=0.4)
+    assert count_costs("cohog", w1=256) is None
+    assert count_costs("cohog", matching="thesis") is None
+    assert count_costs("hog") is None
+    assert count_costs("cohog", load_board("odroid-xu4")) is None
+
+
+def read_instructions():
+    results = Path(__file__).parents[3] / "benchmarks" / "results" / "arm64.json"
+    return {row["part"]: row["instructions"] for row in json.loads(results.read_text())["parts"]}
