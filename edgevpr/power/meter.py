@@ -1,8 +1,5 @@
-"""Metering of queries: wall and CPU seconds, utilisation and charge of each query, and the totals of a flight. Also the
-machine's CPU load and memory, to report to autopilot and ground station.
-
-Energies add up, powers do not (see `equations`, which explains a, s and U). The idle energy a T of a flight of T
-seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, whatever the order of the stages."""
+"""Metering of queries: wall and CPU seconds, utilisation and charge of each query. Also the machine's CPU load and
+memory, to report to autopilot and ground station. Energies add up, powers do not (see `equations`)."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -112,26 +109,6 @@ def compute_query_cost(
         used_mah=1000 * pack_ah(used_j, pack, regulator_efficiency),
         marginal_mah=1000 * pack_ah(marginal_j, pack, regulator_efficiency),
     )
-
-
-class FlightEnergy:
-    """Sums the stages of a flight since the creation of this object: `marginal_j` is the energy that they added, in
-    joules at the board's input. `cpu_clock` counts all threads."""
-
-    def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
-        self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
-        self._start_s, self._cpu_start_s = clock(), cpu_clock()
-        self.marginal_j = 0.0
-
-    def add(self, *stages: StageCost) -> None:
-        """Add stages that have ended."""
-        for stage in stages:
-            u = stage.utilisation(self._board.cores)
-            self.marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)
-
-    def measure_process(self) -> StageCost:
-        """Return the wall seconds and the CPU-seconds of the whole process since the creation of this object."""
-        return StageCost(self._clock() - self._start_s, self._cpu_clock() - self._cpu_start_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from edgevpr.core.text import show_progress
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
+from edgevpr.power.thermal import ThermalWatch
 from edgevpr.review.compare import Line, PacketComparison
 from edgevpr.review.tape import Playback, ReplayedDriver, ReplayedSigning, ReplayedSource, TapeEnded, read_tape
 from edgevpr.runtime.flight.boundary import TapedStop, TapedTurns, tape_clock, tape_machine
@@ -71,7 +72,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             place_map=place_map,
             log=replace(config.log, path=replay_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
-            machine=tape_machine(Machine(board), playback),
+            machine=tape_machine(Machine(measure_heat=ThermalWatch().read), playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_read_frame, folder)),
             turns=TapedTurns(Clock().mono_s, playback),
             drive=partial(ReplayedDriver, playback),

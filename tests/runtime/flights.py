@@ -11,6 +11,7 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
 from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.power.meter import QueryMeter
+from edgevpr.power.thermal import ThermalWatch
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.flight import Flight as FlightItself
 from edgevpr.runtime.flight.flightio import FlightParts
@@ -62,6 +63,7 @@ class Flight:
                 autopilot = AutopilotOutput(
                     self.link, navigator, notifier, settings=settings, cores=self.board.cores, clock=clock
                 )
+            machine = Machine(measure_heat=ThermalWatch(hot_c=self.board.thermal_limit_c).read)
             parts = FlightParts(
                 recogniser=self.recogniser,
                 source=source,
@@ -69,10 +71,8 @@ class Flight:
                 autopilot=autopilot,
                 flight_log=flight_log,
                 notifier=notifier,
-                meter=meter or FlightMeter(self.config.battery, self.board, clock),
-                io=SimpleNamespace(
-                    board=self.board, clock=clock, machine=Machine(self.board), stop=self.stop, status=status
-                ),
+                meter=meter or FlightMeter(self.config.battery, self.board, clock, machine),
+                io=SimpleNamespace(board=self.board, clock=clock, machine=machine, stop=self.stop, status=status),
             )
             accuracy_m = settings.min_accuracy_m
             FlightItself(parts, self.config.source, min_accuracy_m=accuracy_m, fewer_candidates=fewer_candidates).run()
@@ -98,9 +98,10 @@ def make_meter(config: Config, recogniser: Recogniser, clock: FakeClock) -> Quer
     return QueryMeter(board, config.battery, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
-def make_flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) -> FlightMeter:
+def make_flight_meter(flight: Flight, kind=FlightMeter, watch: ThermalWatch | None = None, **more) -> FlightMeter:
     """A meter of the flight as a whole, for a test that looks into it."""
-    return kind(flight.config.battery, flight.board, flight.clock.clock, **more)
+    machine = Machine(measure_heat=(watch or ThermalWatch()).read)
+    return kind(flight.config.battery, flight.board, flight.clock.clock, machine, **more)
 
 
 def select(lines: list[dict], kind: str) -> list[dict]:

@@ -81,23 +81,16 @@ _MEASUREMENTS: dict[str, tuple[str, type[Any] | None]] = {
 
 def tape_machine(machine: Machine, tape: Tape) -> Machine:
     """Return the same machine with each measurement recorded on the `tape`, or played back from it."""
-    return cast(Machine, _TapedMachine(machine, tape))
 
-
-class _TapedMachine:
-    def __init__(self, machine: Machine, tape: Tape) -> None:
-        self._machine, self._tape = machine, tape
-
-    def __getattr__(self, name: str) -> Any:
+    def measure(name: str, *args: Any) -> Any:
         kind, value_type = _MEASUREMENTS[name]
-        return partial(self._measure, kind, value_type, getattr(self._machine, name))
-
-    def _measure(self, kind: str, value_type: type[Any] | None, measure: Callable[..., Any], *args: Any) -> Any:
         if value_type is None:
-            return self._tape.read(kind, partial(measure, *args))
-        values = self._tape.read(kind, lambda: astuple(measure(*args)))
+            return tape.read(kind, partial(getattr(machine, name), *args))
+        values = tape.read(kind, lambda: astuple(getattr(machine, name)(*args)))
         names = [field.name for field in fields(value_type)]
         return value_type(**dict(zip(names, values, strict=False)))  # an older tape may have fewer values
+
+    return replace(machine, **{name: partial(measure, name) for name in _MEASUREMENTS})
 
 
 class TapedStop(Stop):

@@ -122,7 +122,7 @@ class Flight:
                 autopilot=autopilot,
                 flight_log=flight_log,
                 notifier=notifier,
-                meter=FlightMeter(config.battery, io.board, io.clock, machine=io.machine),
+                meter=FlightMeter(config.battery, io.board, io.clock, io.machine),
                 io=io,
             )
             fewer = () if config.match.candidates else list_safe_candidates(recogniser.technique)
@@ -235,7 +235,7 @@ class Flight:
                     update(event)
                 except Exception:
                     _log.exception("%s failed", update.__qualname__)
-        meter.energy.add(reporting.cost)
+        meter.add(reporting.cost)
 
     def _log_event(self, event: Recognition) -> None:
         if event.frame is None or not event.is_query:

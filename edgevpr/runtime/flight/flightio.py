@@ -23,6 +23,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import Signing, open_signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.power.boards import Board, load_board, resolve_board
+from edgevpr.power.thermal import ThermalWatch
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.boundary import (
@@ -123,7 +124,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
             place_map=config.map,
             log=config.log,
             clock=Clock(),
-            machine=Machine(board),
+            machine=Machine(measure_heat=ThermalWatch(hot_c=board.thermal_limit_c).read),
             open_source=open_paced,
             turns=Turns(Clock().mono_s),
             drive=PortDriver,

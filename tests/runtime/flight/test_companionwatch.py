@@ -13,7 +13,6 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState, ThermalWatch
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
-from edgevpr.runtime.flight.machine import Machine
 
 FINE = ThermalState(temperature_c=60.0, frequency_mhz=1800.0, throttled=False, why="", under_voltage=False, hot=False)
 LOW = replace(FINE, why="under-voltage now", under_voltage=True)
@@ -63,7 +62,7 @@ def test_companion_watch_reports_under_voltage_everywhere(make_flight, clock, li
             statuses.append(status)
             tree({firmware: {1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n")})
 
-    meter = make_flight_meter(flight, machine=Machine(flight.board, ThermalWatch(root)))
+    meter = make_flight_meter(flight, watch=ThermalWatch(root))
     lines = flight.fly(FakeSource([draw_texture(1, 240, 320)] * 45, clock), meter, status=Status())
     notes = [(line["note"]["code"], line["why"]) for line in select(lines, "companion")]
     begun = str(Reason(ReasonCode.UNDER_VOLTAGE))

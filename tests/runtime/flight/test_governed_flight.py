@@ -18,8 +18,8 @@ BUSY = LoadReading(cpu_share=1.0, late_share=0.0, rss_mb=100.0, temperature_c=40
 class ScriptedMeter(FlightMeter):
     """A meter that reads what stands in a script, a reading a turn, and calm after its end."""
 
-    def __init__(self, battery, board, clock, *, readings):
-        super().__init__(battery, board, clock)
+    def __init__(self, battery, board, clock, machine, *, readings):
+        super().__init__(battery, board, clock, machine)
         self._readings, self._begin_s, self._now = readings, clock.mono_s(), clock.mono_s
 
     def read_load(self):

@@ -11,7 +11,6 @@ from flights import make_flight_meter, select
 from pictures import draw_texture
 
 from edgevpr.power.thermal import ThermalState
-from edgevpr.runtime.flight.machine import Machine
 
 pytestmark = pytest.mark.slow
 
@@ -56,7 +55,7 @@ def test_throttling_is_logged_and_announced_and_marks_the_figures(make_flight, c
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     flight = make_flight("hog")
     watch = SimpleNamespace(read=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
-    meter = make_flight_meter(flight, machine=Machine(flight.board, watch))
+    meter = make_flight_meter(flight, watch=watch)
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in select(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))
