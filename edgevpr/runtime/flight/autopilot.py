@@ -12,7 +12,7 @@ from edgevpr.core.types import FixReport, Frame
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import Fix
+from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
@@ -146,7 +146,7 @@ class AutopilotOutput:
         if abs(age.delay_s - self._delay_s) > _MIN_REPORTED_DELAY_S:
             self._delay_s = age.delay_s
             note = self._delay_note or Reason(ReasonCode.DELAY_GONE)
-            self._notifier.report("age", messages.Severity.INFO, note, delay_s=age.delay_s)
+            self._notifier.report("age", Severity.INFO, note, delay_s=age.delay_s)
         if not age.is_unknown:
             return event
         return replace(event, accepted=False, located=None, accuracy_m=None, reason=_UNKNOWN_AGE)
@@ -221,9 +221,8 @@ class AutopilotOutput:
         has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
         answered_s = stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf)
         if number := self._source_sets.choose_set(now_s, self._navigator.has_gps, has_own, answered_s):
-            self._notifier.announce(
-                messages.Severity.WARNING, f"requested source set {number} from the autopilot", topic="sources"
-            )
+            text = f"requested source set {number} from the autopilot"
+            self._notifier.announce(Severity.WARNING, text, topic="sources")
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:
@@ -240,10 +239,11 @@ class AutopilotOutput:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("%s: %s; no fix is sent", event.name, error)
-            return report_unsent(event, Reason(ReasonCode.INVALID_POSITION, {"problem": str(error)})), None
+            why = Reason(ReasonCode.INVALID_POSITION, {"problem": str(error)})
+            return FixReport(query=event.name, sent=False, why=why), None
         self._report_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
-            return report_unsent(event, advice.why or DRY_RUN), None
+            return FixReport(query=event.name, sent=False, why=advice.why or DRY_RUN), None
         return None, self._link.send_fix(advice.fix)
 
     def _report_held(self, objection: Reason | None) -> None:
@@ -252,11 +252,9 @@ class AutopilotOutput:
         self._held += self._is_holding
         if self._is_holding and not before:
             gcs_text = "fix held back, contradicts autopilot"
-            self._notifier.announce(
-                messages.Severity.WARNING, f"a fix is {objection}", gcs_text=gcs_text, topic="held back"
-            )
+            self._notifier.announce(Severity.WARNING, f"a fix is {objection}", gcs_text=gcs_text, topic="held back")
         elif before and not self._is_holding:
-            self._notifier.announce(messages.Severity.INFO, "fixes agree again", topic="held back")
+            self._notifier.announce(Severity.INFO, "fixes agree again", topic="held back")
 
 
 class SourceSets:
@@ -293,11 +291,6 @@ class SourceSets:
 def _position_fields(fix: Fix) -> dict[str, float]:
     position = {"lat_deg": round(fix.lat_deg, 7), "lon_deg": round(fix.lon_deg, 7)}
     return {**position, "accuracy_m": round(fix.accuracy_m, 2)}
-
-
-def report_unsent(event: Recognition, why: Reason) -> FixReport:
-    """Return the report of a fix that was not sent for the reason `why`."""
-    return FixReport(query=event.name, sent=False, why=why)
 
 
 def combine_confidence(event: Recognition) -> float | None:

@@ -18,18 +18,14 @@ _NOTES = {
 
 
 class CompanionWatch:
-    """Reports each problem of the companion computer once when it begins and once when it ends."""
+    """Reports each problem of the companion computer once when it begins and once when it ends. `problems`: the texts
+    of those that have not ended."""
 
     def __init__(self, notifier: Notifier) -> None:
         self._notifier = notifier
         self._last_true_s: dict[str, float] = {}  # when each problem was last reported by the board
         self._reported_s: dict[str, float] = {}  # when the start or end of each problem was last reported
-        self._active: dict[str, str] = {}  # reported problems that have not ended, with their texts
-
-    @property
-    def problems(self) -> tuple[str, ...]:
-        """Texts of the current problems."""
-        return tuple(self._active.values())
+        self.problems: dict[str, str] = {}
 
     def take(self, now_s: float, state: ThermalState) -> None:
         """Process a reading, once a second, and report changes. An unknown value (None) changes nothing."""
@@ -39,7 +35,7 @@ class CompanionWatch:
                 self._last_true_s[problem] = now_s
             is_active = now_s - self._last_true_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
             is_early = now_s - self._reported_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
-            if not is_early and (is_active or value is not None) and is_active != (problem in self._active):
+            if not is_early and (is_active or value is not None) and is_active != (problem in self.problems):
                 self._report(now_s, problem, is_active, state)
 
     def _report(self, now_s: float, problem: str, is_active: bool, state: ThermalState) -> None:
@@ -47,8 +43,8 @@ class CompanionWatch:
         note = Reason(code, {"temperature_c": state.temperature_c} if code.parameters else {})
         self._reported_s[problem] = now_s
         if is_active:
-            self._active[problem] = str(note)
+            self.problems[problem] = str(note)
         else:
-            del self._active[problem]
+            del self.problems[problem]
         severity = Severity.WARNING if is_active else Severity.INFO
         self._notifier.report("companion", severity, note, topic=f"companion {problem}", why=state.why)

@@ -11,7 +11,7 @@ from typing import Any
 from edgevpr.core.config import Config, MavlinkConfig, SourceConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.types import Frame, Position
+from edgevpr.core.types import FixReport, Frame, Position
 from edgevpr.frames.level import Mount
 from edgevpr.frames.source import read_intervals
 from edgevpr.mavlink.address import parse_link
@@ -19,7 +19,7 @@ from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.autopilot import DRY_RUN, AutopilotOutput, report_unsent
+from edgevpr.runtime.flight.autopilot import DRY_RUN, AutopilotOutput
 from edgevpr.runtime.flight.camerawatch import MirrorWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, open_real_io
@@ -158,9 +158,9 @@ class Flight:
 
     def _remarks(self) -> tuple[str | None, ...]:
         """Return short remarks for the status, in addition to the counts (None: nothing to report)."""
-        restriction = self._actuator.governor.restriction
+        paused, restriction = "paused" if self._commands.is_paused else None, self._actuator.governor.restriction
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
-        return self._commands.summary, age, restriction, self._map_watch.summary, self._parts.flight_log.fault
+        return paused, age, restriction, self._map_watch.summary, self._parts.flight_log.fault
 
     def _run_pass(self) -> None:
         """Run one pass of the loop, with one frame at most."""
@@ -227,7 +227,8 @@ class Flight:
                 if self._parts.autopilot:
                     event = self._parts.autopilot.report_match(event, meter.totals()["used_mah"])
                 elif event.accepted:
-                    event = replace(event, fix=report_unsent(event, Reason(ReasonCode.NO_LINK)))
+                    why = Reason(ReasonCode.NO_LINK)
+                    event = replace(event, fix=FixReport(query=event.name, sent=False, why=why))
             except Exception:
                 _log.exception("the match could not be sent to the autopilot")
             for update in self._observers:

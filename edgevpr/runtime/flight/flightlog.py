@@ -9,7 +9,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from io import FileIO
@@ -37,7 +37,7 @@ _MAX_FILES = 4  # that use `max_mb` together: the current file and three numbere
 _SYNC_INTERVAL_S = 1.0
 
 
-class FlightLog:
+class FlightLog(AbstractContextManager["FlightLog"]):
     """Writer of a flight log (a context manager); with `path` None nothing is written.
 
     `path` is the log of the newest flight. The file of an earlier flight is rotated: renamed to the next number (see
@@ -86,9 +86,6 @@ class FlightLog:
                         "in a folder that exists and is writable."
                     ) from error
                 self._record_error(error)
-
-    def __enter__(self) -> "FlightLog":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -10,10 +10,6 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
 
-_COMMAND_CODES = {
-    UserCommand.PAUSE: ReasonCode.PAUSED_BY_COMMAND,
-    UserCommand.RESUME: ReasonCode.RESUMED_BY_COMMAND,
-}
 _MAX_GCS_BYTES = MAX_TEXT_BYTES - len("edgevpr: ")  # length limit of a text for the ground station
 
 _log = logging.getLogger(__name__)
@@ -63,13 +59,13 @@ class Alert:
         self.is_active = False
         self._notifier, self._kind, self._onset, self._cleared = notifier, kind, onset, cleared
 
-    def update(self, is_active: bool) -> None:
-        """Set whether the condition holds now, and report if that has changed."""
+    def update(self, is_active: bool, **fields: Any) -> None:
+        """Set whether the condition holds now. If that has changed, report it, with `fields` in the flight log."""
         if is_active == self.is_active:
             return
         self.is_active = is_active
         note = self._onset if is_active else Reason(self._cleared)
-        self._notifier.report(self._kind, Severity.WARNING if is_active else Severity.INFO, note)
+        self._notifier.report(self._kind, Severity.WARNING if is_active else Severity.INFO, note, **fields)
 
 
 class Commands:
@@ -78,11 +74,6 @@ class Commands:
     def __init__(self, link: Link | None, notifier: Notifier) -> None:
         self.is_paused = False
         self._link, self._notifier = link, notifier
-
-    @property
-    def summary(self) -> str | None:
-        """The word "paused" while the flight is paused, else None."""
-        return "paused" if self.is_paused else None
 
     def obey(self) -> None:
         """Carry out the request received since the last call, if any, then let the link accept new requests."""
@@ -93,9 +84,9 @@ class Commands:
         self._link.accept_commands()
 
     def _carry_out(self, request: CommandRequest) -> None:
-        is_new = self.is_paused != (request.command is UserCommand.PAUSE)
-        self.is_paused = request.command is UserCommand.PAUSE
-        code, name = _COMMAND_CODES[request.command], request.command.name
+        was_paused, self.is_paused = self.is_paused, request.command is UserCommand.PAUSE
+        code = ReasonCode.PAUSED_BY_COMMAND if self.is_paused else ReasonCode.RESUMED_BY_COMMAND
+        name, is_new = request.command.name, self.is_paused != was_paused
         self._notifier.log("command", command=name, sender=request.sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary

@@ -15,7 +15,7 @@ import threading
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,7 +38,7 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
-class Recording(Tape):
+class Recording(Tape, AbstractContextManager["Recording"]):
     """An open recording (a context manager) in the folder `path`: the `Tape` of all input, and frames. `state` is None
     while recording, then a sentence with the reason for its end."""
 
@@ -64,9 +64,6 @@ class Recording(Tape):
             ) from error
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> "Recording":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -4,7 +4,7 @@ keys; the command `edgevpr top` reads it."""
 import json
 import os
 import time
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ STATUS_NAME = "status.json"
 _FILE_MODE = 0o660  # positions are private, but the flight's group may read them
 
 
-class StatusFile:
+class StatusFile(AbstractContextManager["StatusFile"]):
     """Writes the status of a flight (see `Vitals._make_status`) to a file, and removes the file at the end."""
 
     def __init__(self, path: str | Path) -> None:
@@ -32,9 +32,6 @@ class StatusFile:
                 f"The status file {path} cannot be created ({error.strerror or error}): set status.file to a path in "
                 "an existing, writable folder, or remove it."
             ) from error
-
-    def __enter__(self) -> "StatusFile":
-        return self
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):

@@ -139,15 +139,12 @@ class MapSurvey:
         correlation = max(1.0, _GPS_CORRELATION_S / min(t_s - self._last_s, _GPS_CORRELATION_S))
         self._origin = self._origin or reference
         jacobian[:, 4] = offset_between_m(self._origin, reference)
-        offset_m = np.array(offset_between_m(reference, match.position))
-        independent_m2 = float(np.trace(match.scatter_m2)) / 2 - located.tilt_m2  # the tilt is a parameter
-        correlated_m2 = vehicle.gps.sd_m**2
         self._samples.append(
             SurveySample(
                 jacobian=jacobian,
-                offset_m=offset_m,
-                independent_m2=independent_m2,
-                correlated_m2=correlated_m2,
+                offset_m=np.array(offset_between_m(reference, match.position)),
+                independent_m2=float(np.trace(match.scatter_m2)) / 2 - located.tilt_m2,  # the tilt is a parameter
+                correlated_m2=vehicle.gps.sd_m**2,
                 correlation=correlation,
                 distrusts_gps=distrusts_gps,
             )

@@ -179,7 +179,7 @@ class Vitals:
             "newest": self._newest,
             "match": self._match,
             "link": parts.autopilot.state() if parts.autopilot else None,
-            "remarks": [remark for remark in (*self._companion.problems, *self._remarks()) if remark],
+            "remarks": [remark for remark in (*self._companion.problems.values(), *self._remarks()) if remark],
         }
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []

@@ -62,7 +62,7 @@ class MapWatch:
 
     def __init__(self, notifier: Notifier) -> None:
         self.left_out = 0
-        self._notifier, self._is_lost = notifier, False
+        self._notifier, self._lost = notifier, Alert(notifier, "map", Reason(ReasonCode.MAP_LOST), ReasonCode.MAP_BACK)
 
     @property
     def summary(self) -> str | None:
@@ -79,11 +79,8 @@ class MapWatch:
             text = f"map damaged: place {event.left_out[0][0]} cannot be read and is left out"
             self._notifier.announce(Severity.WARNING, text, gcs_text=gcs_text, topic="left out")
         self.left_out += len(event.left_out)
-        if event.is_query and event.map_lost != self._is_lost:
-            self._is_lost = event.map_lost
-            severity = Severity.WARNING if self._is_lost else Severity.INFO
-            note = Reason(ReasonCode.MAP_LOST if self._is_lost else ReasonCode.MAP_BACK)
-            self._notifier.report("map", severity, note, reason=event.reason)
+        if event.is_query:
+            self._lost.update(event.map_lost, reason=event.reason)
 
 
 class MapCoverageWatch:

@@ -167,8 +167,8 @@ def choose_best(options: Sequence[Option]) -> Option | None:
     """Choose the most accurate option without an objection; of equally accurate ones, that with the least CPU time.
     Returns None if no option is suitable."""
     suitable = [(option.accuracy, option) for option in options if option.accuracy and option.objection is None]
-    suitable.sort(key=lambda pair: (-pair[0].recall_at_1, pair[1].cpu_s))
-    return suitable[0][1] if suitable else None
+    _, best = min(suitable, key=lambda pair: (-pair[0].recall_at_1, pair[1].cpu_s), default=(None, None))
+    return best
 
 
 def explain_no_choice(options: Sequence[Option], board: Board) -> str:

@@ -37,10 +37,9 @@ class Finding:
 
     def fields(self) -> dict[str, Any]:
         """Return the finding as fields of JSON."""
-        level = "ok" if self.ok else "wrong"
         return {
             "what": self.what,
-            "level": level,
+            "level": "ok" if self.ok else "wrong",
             **self.reason.fields(),
             "changes": self.changes,
             "exit_code": self.exit_code,
