@@ -135,10 +135,8 @@ class StampedTime:
         if t_mono_s - self._start_s < _SPAN_LATER_S:
             drift_s += _MIN_RISE_S / 2  # a rate error may not be visible yet
         # A camera that stamps pictures by counting them may have taken any of them later than its stamp.
-        is_uncertain = is_estimated or self._max_known_age_s < math.inf
-        return CaptureTime(
-            taken_s, math.hypot(FRAME_TIME_SD_S, drift_s, self._scatter_s, age_s / 2 if is_uncertain else 0.0)
-        )
+        count_sd_s = age_s / 2 if is_estimated or self._max_known_age_s < math.inf else 0.0
+        return CaptureTime(taken_s, math.hypot(FRAME_TIME_SD_S, drift_s, self._scatter_s, count_sd_s))
 
     def _keep_newest(self, pictures: int) -> None:
         """Drop all but the newest pictures; `pictures` is their number."""

@@ -10,6 +10,9 @@ from urllib.parse import urlsplit
 
 import av
 import av.logging
+from av.container import InputContainer
+from av.packet import Packet
+from av.video.frame import VideoFrame
 
 from edgevpr.core.arrays import Image
 from edgevpr.frames.images import is_whole_jpeg
@@ -17,10 +20,6 @@ from edgevpr.frames.pixels import PixelConverter
 from edgevpr.frames.shot import OpeningError, Refusal, StreamFacts
 
 if TYPE_CHECKING:
-    from av.container import InputContainer
-    from av.packet import Packet
-    from av.video.frame import VideoFrame
-
     from edgevpr.frames.webpictures import ResponseFile
 
 # FFmpeg's messages are searched for reports of lost packets, then discarded: edgevpr reports faults in its own words.
@@ -74,10 +73,12 @@ def open_decoder(
         try:
             container = av.open(file or uri, "r", format=format_name, options=options, timeout=timeouts_s)
         except (av.FFmpegError, OSError, ValueError) as error:
-            messages = [message for _, _, message in log_lines]
+            text = "\n".join(message for _, _, message in log_lines)
             if file:
                 file.close()
-            raise _explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
+            if "SETUP failed: 461" in text or "Nonmatching transport" in text:
+                raise TransportError("transport refused (461)") from None
+            raise OpeningError(_find_cause(uri, error, text, timeouts_s[0] if timeouts_s else 0.0)) from None
     if container.streams.video and getattr(container.streams.video[0], "codec_context", None):  # None: unknown codec
         return VideoDecoder(container, _has_loss(log_lines), file)
     has_video = bool(container.streams.video)
@@ -91,16 +92,9 @@ def _has_loss(log_lines: list[tuple[int, str, str]]) -> bool:
     return any(_LOSS_WORD in message for _, _, message in log_lines)
 
 
-def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
-    """Return the error that explains why FFmpeg could not open `uri` within `timeout_s` seconds. Some causes appear
-    only in the `messages` that FFmpeg logged. The text never contains the address, which may contain a password."""
-    text = "\n".join(messages)
-    if "SETUP failed: 461" in text or "Nonmatching transport" in text:
-        return TransportError("transport refused (461)")
-    return OpeningError(_find_cause(uri, error, text, timeout_s))
-
-
 def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
+    """Return why FFmpeg could not open `uri` within `timeout_s` seconds. Some causes appear only in the `text` that
+    FFmpeg logged. The result never contains the address, which may contain a password."""
     if host := _UNKNOWN_HOST_PATTERN.search(text):
         if uri.count("@") > 1:  # the host may be part of the password
             return "no such host: percent-encode special characters in the password, such as @ as %40"
@@ -133,7 +127,7 @@ class VideoDecoder:
     packets are rejected until this is set to False."""
 
     def __init__(
-        self, container: "InputContainer", is_backlog_doubtful: bool, file: "ResponseFile | None" = None
+        self, container: InputContainer, is_backlog_doubtful: bool, file: "ResponseFile | None" = None
     ) -> None:
         self.container, self.stream, self._file = container, container.streams.video[0], file
         self.unit_s = float(self.stream.time_base or 1e-6)  # of the timestamps
@@ -183,7 +177,7 @@ class VideoDecoder:
         reason: LATE, or the reason of an earlier rejection that is still in effect."""
         return self._refuse(Refusal.LATE)
 
-    def decode(self, fetched: TimedPacket) -> "list[VideoFrame] | Refusal":
+    def decode(self, fetched: TimedPacket) -> list[VideoFrame] | Refusal:
         """Return the images that this packet completes (none, one or, at the end, several), or why it is rejected."""
         packet = fetched.packet
         if not packet.size:
@@ -202,11 +196,11 @@ class VideoDecoder:
             return self._refuse()
         return self._decode_packet(packet)
 
-    def make_thumbnail(self, picture: "VideoFrame") -> Image:
+    def make_thumbnail(self, picture: VideoFrame) -> Image:
         """Return a coarse grey copy of an image, see `Shot.thumbnail`."""
         return self._converter.make_thumbnail(picture)
 
-    def prepare_conversion(self, picture: "VideoFrame") -> Callable[[], Image]:
+    def prepare_conversion(self, picture: VideoFrame) -> Callable[[], Image]:
         """Return a function that converts an image to pixels, uint8 (H, W, 3) BGR or (H, W) grey; any thread may call
         it. Images of maps and queries are both converted here, so that equal images give equal pixels."""
         aspect = self._codec.sample_aspect_ratio or self.stream.sample_aspect_ratio
@@ -218,7 +212,7 @@ class VideoDecoder:
         if self._file:
             self._file.close()
 
-    def _decode_packet(self, packet: "Packet[Any]") -> "list[VideoFrame] | Refusal":
+    def _decode_packet(self, packet: "Packet[Any]") -> list[VideoFrame] | Refusal:
         with av.logging.Capture():
             try:
                 pictures = self._codec.decode(packet)

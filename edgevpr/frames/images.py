@@ -26,7 +26,6 @@ EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm",
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
 _MAX_FILE_BYTES = 4 * MAX_PIXELS  # of an uncompressed image with an alpha channel
-_SMALL_PX = 640
 _SMALL_QUALITY = 80
 _WEBP_QUALITY = 55
 _RECORDING_QUALITY = 95
@@ -115,7 +114,7 @@ def encode_jpeg(image: Image) -> bytes:
     return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _RECORDING_QUALITY))
 
 
-def encode_small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
+def encode_small_jpeg(image: Image, longest_px: int) -> bytes:
     """Encode an image, uint8 (H, W[, 3]), as a JPEG for viewing, its longest side at most `longest_px`."""
     return _encode(".jpg", limit_size(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 

@@ -177,11 +177,8 @@ class LiveSource(Source):
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
         if opening.opened_s is not None:
             return self._liveness.find_fault(now_s)
-        return (
-            Fault(Condition.LOST, "lost: the opening hangs", True)
-            if now_s - opening.start_s > _OPENING_TIMEOUT_S
-            else None
-        )
+        is_hung = now_s - opening.start_s > _OPENING_TIMEOUT_S
+        return Fault(Condition.LOST, "lost: the opening hangs", True) if is_hung else None
 
     def _wait_for_threads(self, fault: Fault) -> None:
         while not self._closing.is_set():

@@ -4,7 +4,8 @@ thread receives packets as they arrive (`PacketQueue`); the thread of `frames.li
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+
+from av.video.frame import VideoFrame
 
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S, CaptureTime, StampedTime, UnstampedTime
@@ -12,9 +13,6 @@ from edgevpr.frames.decoding import TimedPacket, TransportError, VideoDecoder, o
 from edgevpr.frames.rtp import describe_rtp
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
 from edgevpr.frames.webpictures import ResponseFile, SnapshotCapture, try_request
-
-if TYPE_CHECKING:
-    from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
 # `frames.live` closes a stream without images earlier; this limit allows for the second image of a slow camera. A
@@ -139,7 +137,7 @@ class StreamCapture:
         if stamped.is_live:
             self._decoder.is_backlog_doubtful = False  # the packets from now on were sent after the opening
 
-    def _make_shot(self, picture: "VideoFrame", unstamped: CaptureTime, arrival_s: float) -> Shot | Refusal:
+    def _make_shot(self, picture: VideoFrame, unstamped: CaptureTime, arrival_s: float) -> Shot | Refusal:
         taken: CaptureTime | None = unstamped
         if self._stamped:
             taken = (

@@ -5,7 +5,8 @@ from collections import deque
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from av.video.frame import VideoFrame
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
@@ -13,9 +14,6 @@ from edgevpr.frames.decoding import VideoDecoder, open_decoder
 from edgevpr.frames.positions import GeoTag, Track, parse_time
 from edgevpr.frames.shot import OpeningError, Refusal
 from edgevpr.frames.source import RecordingSource, make_frame
-
-if TYPE_CHECKING:
-    from av.video.frame import VideoFrame
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska stores milliseconds
 _DEFAULT_RATE_HZ = 25.0
@@ -110,7 +108,7 @@ class VideoSource(RecordingSource):
         else:
             self._ready.extend(pictures)
 
-    def _advance(self, picture: "VideoFrame") -> bool:
+    def _advance(self, picture: VideoFrame) -> bool:
         """Advance index and video time to `picture`, the next one decoded; return True if it should be returned."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._decoder.unit_s

@@ -53,12 +53,6 @@ _SOURCE_VISION = 6
 _SOURCE_GSF = 8
 _SOURCE_BARO = 1
 _SOURCE_COMPASS = 1
-# Fields of ODOMETRY that repeat the autopilot's own estimate: name of the source, its wrong value, and a correct one.
-_OWN_SOURCES = (
-    ("POSZ", _SOURCE_VISION, _SOURCE_BARO),
-    ("VELZ", _SOURCE_VISION, 0),
-    ("YAW", _SOURCE_VISION, _SOURCE_COMPASS),
-)
 _MAX_GPS_DELAY_MS = 250  # the maximum length of EKF3's buffer: AP_NavEKF3_core.cpp, setup_core
 _MAX_GLITCH_RADIUS_M = 100
 _MAX_VISION_SD_M = 10
@@ -237,7 +231,10 @@ _RULES = (
         "Our velocity comes from the same matches as our position; the filter would trust it more than its gyros.",
         "EK3_SRCn_VELXY"),
     require(_ODOMETRY, "POSZ, VELZ and YAW not 6",
-        join_checks(*(_refuse_source(*source) for source in _OWN_SOURCES)),
+        join_checks(
+            _refuse_source("POSZ", _SOURCE_VISION, correct=_SOURCE_BARO),
+            _refuse_source("VELZ", _SOURCE_VISION, correct=0),
+            _refuse_source("YAW", _SOURCE_VISION, correct=_SOURCE_COMPASS)),
         "Height, climb and heading in our ODOMETRY are the autopilot's own: it would confirm them.", "EK3_SRCn_*"),
     require(_ODOMETRY, "without bit 8, if one source set uses GPS and one uses our positions",
         Check(("EK3_SRC_OPTIONS", *_name_sources("POSXY")), _check_set_per_lane),

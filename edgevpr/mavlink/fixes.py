@@ -180,18 +180,16 @@ class Fixes:
         while self._awaited:
             self._give_up(reason)
 
-    def report_silence(self, why_silent: Reason, now_s: float) -> None:
-        """Report when fixes are no longer answered (with the likely reason `why_silent`), or are answered again."""
+    def report_silence(self, why: Reason, now_s: float) -> None:
+        """Report when fixes are no longer answered (with the likely reason `why`), or are answered again."""
         self.expire_unanswered(now_s)
         is_stopped = self._consecutive_unanswered >= MAX_UNANSWERED
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWER_TIMEOUT_S):
             return
         self._is_stopped = is_stopped
         if is_stopped:
-            log.warning(
-                "no answer to five consecutive fixes (%s): now sending one every %g s", why_silent, RETRY_INTERVAL_S
-            )
-            self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.code.summary}", "answers")
+            log.warning("no answer to five consecutive fixes (%s): now sending one every %g s", why, RETRY_INTERVAL_S)
+            self._announce(Severity.WARNING, f"fixes unanswered: {why.code.summary}", "answers")
         else:
             log.warning("position fixes are answered again: sending has resumed")
             self._announce(Severity.INFO, "fixes are answered again", "answers")

@@ -52,11 +52,9 @@ class Px4Fusion:
         if state is None or (is_vision and origin is None):
             return None
         self._sent_s, self._is_vision = now_s, is_vision
-        return (
-            messages.make_vision_position(state, origin)
-            if is_vision and origin
-            else messages.make_position_sensor(state)
-        )
+        if is_vision and origin:
+            return messages.make_vision_position(state, origin)
+        return messages.make_position_sensor(state)
 
     def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_trusted: bool = True) -> None:
         """Process an ESTIMATOR_STATUS. `receiver`: the best GPS receiver with a fix (None: none has a fix).

@@ -105,10 +105,8 @@ class RequestLink(AbstractContextManager["RequestLink"]):
                 pending = set(batch)
                 while pending and (answer := self._wait_for(ANSWER_TIMEOUT_S, _match_parameters(pending))):
                     pending.remove(answer.param_id)
-                    if (
-                        answer.get_type() == "PARAM_VALUE"
-                        and (value := read_parameter_value(answer, bytewise)) is not None
-                    ):
+                    value = read_parameter_value(answer, bytewise) if answer.get_type() == "PARAM_VALUE" else None
+                    if value is not None:
                         values[answer.param_id] = value
             missing = [name for name in missing if name not in values]
         return values

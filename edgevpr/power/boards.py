@@ -122,9 +122,8 @@ def _read_board(path: Path) -> Board:
 def _detect_board(root: Path) -> Board:
     """Return the profile of this machine's board, or else generic-x86, with the cores and memory of this machine."""
     model = machine.read_model(root)
-    detected = next(
-        (board for board in map(_read_shipped_board, list_boards() if model else ()) if _has_model(board, root)), None
-    )
+    boards = map(_read_shipped_board, list_boards() if model else ())
+    detected = next((board for board in boards if _has_model(board, root)), None)
     profile = detected or _read_shipped_board(_FALLBACK_BOARD)
     title = profile.title
     if model and not detected:

@@ -289,9 +289,8 @@ class CoHog:
         place = overlay.compute_structure(reference, is_known, tuning.SURROUND_SD_CELLS[self.camera])
         if self._is_nadir:
             warped = overlay.overlay_query(*views.halved, match, cells)
-            return overlay.measure_prominence(
-                self._make_structure(*self._make_blocks(*warped, len(warped[0]) // cells)), place
-            )
+            structure = self._make_structure(*self._make_blocks(*warped, len(warped[0]) // cells))
+            return overlay.measure_prominence(structure, place)
         if views.structure is None:
             views.structure = self._make_structure(views.make_blocks(1.0, 0)[0], views.seen)
         return overlay.compute_agreement(views.structure, place, match.shift_cells or (0.0, 0.0))

@@ -49,9 +49,8 @@ def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkV
     """Make `calc`: the descriptor of an autoencoder trained to predict the HOG of an image from a distorted copy of
     it, compared by cosine (Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 values from
     a grey, histogram-equalised image of 160x120)."""
-    return NetworkVector(
-        "calc", open_backbone(model, "descriptor", threads), None, parameters={"model": model}, form=form
-    )
+    backbone = open_backbone(model, "descriptor", threads)
+    return NetworkVector("calc", backbone, None, parameters={"model": model}, form=form)
 
 
 def alexnet(
@@ -145,10 +144,8 @@ def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -
         normalised: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
         return normalised
 
-    backbone = open_backbone(model, "features", threads)
-    return NetworkVector(
-        name, backbone, head, parameters={"model": model, "levels": levels}, form=form, similarity="l1"
-    )
+    backbone, parameters = open_backbone(model, "features", threads), {"model": model, "levels": levels}
+    return NetworkVector(name, backbone, head, parameters=parameters, form=form, similarity="l1")
 
 
 def pool_pyramid(features: Singles, levels: int) -> Singles:

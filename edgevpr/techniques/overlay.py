@@ -87,11 +87,8 @@ def _measure_strengths(query: Singles, place: Singles) -> tuple[Singles, Singles
     """Return the squared strengths of two structures (squared lengths of their pattern vectors) in each cell, (n, n),
     and the lower limit of the squared scatter."""
     query_sq, place_sq = (query**2).sum(axis=2), (place**2).sum(axis=2)
-    return (
-        query_sq,
-        place_sq,
-        _MIN_SCATTER**2 * float(query_sq.sum()) * float(place_sq.sum()) / place_sq.size,
-    )
+    min_scatter_sq = _MIN_SCATTER**2 * float(query_sq.sum()) * float(place_sq.sum()) / place_sq.size
+    return query_sq, place_sq, min_scatter_sq
 
 
 def _blur_cells(values: Singles, cells: float) -> Singles:
