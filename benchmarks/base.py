@@ -46,12 +46,9 @@ def run(main: Callable[[], object], opencv_threads: int | None = 1) -> None:
 
 def describe_run() -> Row:
     """Return the date, commit and machine of a measurement."""
+    origin = provenance.describe_origin()
     versions = {"python": platform.python_version(), "numpy": np.__version__, "opencv": cv2.__version__}
-    return {
-        "date": provenance.format_date(),
-        "commit": read_commit(),
-        "machine": {**provenance.describe_machine(), **versions},
-    }
+    return {"date": origin["date"], "commit": read_commit(), "machine": {**origin["machine"], **versions}}
 
 
 @cache

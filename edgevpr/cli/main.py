@@ -9,7 +9,7 @@ import threading
 from functools import cache
 
 from edgevpr import __version__
-from edgevpr.cli import evaluation, flying, maps, positions, profile, review, simulation, top
+from edgevpr.cli import flying, lab, maps, positions, profile, review, top
 from edgevpr.cli.screen import LineFormatter, guard_output
 from edgevpr.cli.shared import Parser
 from edgevpr.core.errors import EdgevprError
@@ -23,7 +23,7 @@ EXIT_CODES = {
     "started. A retry would fail too, so systemd does not restart the service. `check` exits as `run` would.",
     130: "Stopped by Ctrl-C. `run` and `top`, which are meant to be stopped this way, exit with 0 or 1.",
 }
-_GROUPS = (positions, maps, flying, top, review, profile, evaluation, simulation)
+_GROUPS = (positions, maps, flying, top, review, profile, lab)
 
 
 def program() -> None:

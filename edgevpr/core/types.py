@@ -152,6 +152,11 @@ class Place:
     salience: Salience | None = None
     pose: Pose | None = None
 
+    @property
+    def recorded_position(self) -> Position | None:
+        """The position before refinement moved it."""
+        return self.pose.recorded if self.pose and self.pose.recorded else self.position
+
 
 @dataclass(frozen=True, slots=True)
 class Candidate:

@@ -4,7 +4,6 @@
 import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,16 +30,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class FinishedMap:
-    """Result of `finish_map`. `refined`, `calibration`: results of the two steps (None: not done).
-    `not_done`: a sentence for each requested step that failed, with the reason."""
-
-    refined: "Refinement | None"
-    calibration: MapCalibration | None
-    not_done: tuple[str, ...]
-
-
 def finish_map(
     place_map: PlaceMap,
     encoder: FrameEncoder,
@@ -49,9 +38,10 @@ def finish_map(
     progress: Progress,
     refine: bool = True,
     calibrate: bool = True,
-) -> FinishedMap:
+) -> "tuple[Refinement | None, MapCalibration | None, tuple[str, ...]]":
     """Refine and calibrate an open map, as far as its technique allows. `pictures` None: not available, so the map is
-    not calibrated. Failures are listed in the result and not raised, because a map is usable without these steps."""
+    not calibrated. Return the results of the two steps (None: not done), and a sentence for each requested step that
+    failed, with the reason. Failures are not raised, because a map is usable without these steps."""
     technique, refined, calibration, not_done = encoder.technique, None, None, []
     if refine and technique.spec.looks_down and not isinstance(pictures, OrthophotoGrid):
         try:
@@ -63,7 +53,7 @@ def finish_map(
             calibration = calibrate_map(place_map, encoder, match, pictures, progress)
         except EdgevprError as error:
             not_done.append(f"the map was not calibrated: {error}")
-    return FinishedMap(refined, calibration, tuple(not_done))
+    return refined, calibration, tuple(not_done)
 
 
 def refine_map(

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles
-from edgevpr.core.geodesy import fit_similarity, offset_m, wrap_deg
+from edgevpr.core.geodesy import fit_similarity, offset_between_m, wrap_deg
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, compute_level_rotation
 from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
@@ -55,8 +55,7 @@ def _measure_heading(
     were taken too close together or share too little ground."""
     if first.position is None or second.position is None:
         return None
-    start_deg, end_deg = ((position.lat_deg, position.lon_deg) for position in (first.position, second.position))
-    east_m, north_m = offset_m(*start_deg, *end_deg)
+    east_m, north_m = offset_between_m(first.position, second.position)
     pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _MIN_STEP_M else None
     if pairs is None:
         return None

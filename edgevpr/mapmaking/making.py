@@ -57,7 +57,7 @@ class MapPlan:
 class BuiltMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
     places with a position. `result`: counts of the frames read. `covered`: the ground that all places cover, by their
-    recorded positions (None: too few). `refined`, `calibration`, `not_done`: see `FinishedMap`."""
+    recorded positions (None: too few). `refined`, `calibration`, `not_done`: see `finish_map`."""
 
     technique: str
     places: int
@@ -122,7 +122,7 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
             raise
         if ground := measure_ground(place_map):
             _log.info("%s", ground.describe(is_flown=isinstance(pictures, FlightPictures)))
-        finishing_result = finish_map(
+        refined, calibration, not_done = finish_map(
             place_map, encoder, config.match, pictures, progress, refine=plan.refine, calibrate=plan.calibrate
         )
         info = describe_map(place_map)
@@ -134,9 +134,9 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
             with_position=info.with_position,
             result=replace(result, **counts),
             covered=ground,
-            refined=finishing_result.refined,
-            calibration=finishing_result.calibration,
-            not_done=finishing_result.not_done,
+            refined=refined,
+            calibration=calibration,
+            not_done=not_done,
         )
 
 

@@ -112,11 +112,7 @@ class OrthophotoSource(RecordingSource):
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _METADATA_BYTES
         side_px = lattice.footprint_m / self._orthophoto.resolution_m
-        warning = (
-            ""
-            if side_px >= _SHARP_WIDTH_PX
-            else f" (too coarse to recognise all of them; {_SHARP_WIDTH_PX} are enough for nearly all)"
-        )
+        warning = f" (too coarse to recognise all of them; {_SHARP_WIDTH_PX} are enough for nearly all)"
         _log.info(
             "%d places will be extracted from the orthophoto: %.2f km2 of ground, %.1f MB, pictures of %.0f pixels a "
             "side%s",
@@ -124,7 +120,7 @@ class OrthophotoSource(RecordingSource):
             len(lattice) * spacing_m**2 / 1e6,
             self.total * place_bytes / 1e6,
             side_px,
-            warning,
+            warning if side_px < _SHARP_WIDTH_PX else "",
         )
 
     def close(self) -> None:

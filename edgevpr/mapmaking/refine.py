@@ -119,7 +119,7 @@ def refine(
     )
     if not refinable:
         return result
-    positions = [_get_recorded_position(place) for place in refinable]
+    positions = [position for place in refinable if (position := place.recorded_position)]
     east_m, north_m = project_to_metres(*np.array([(position.lat_deg, position.lon_deg) for position in positions]).T)
     recorded = east_m + 1j * north_m
     compare_pair = _make_comparer(place_map, technique, refinable, images)
@@ -149,13 +149,6 @@ def refine(
         ),
         is_mirrored=is_mirrored,
     )
-
-
-def _get_recorded_position(place: Place) -> Position:
-    """Return the position that a place had before any refinement."""
-    position = place.pose.recorded if place.pose and place.pose.recorded else place.position
-    assert position is not None  # callers pass only places with a position
-    return position
 
 
 def _is_determined(solution: GraphSolution) -> Bools:

@@ -5,13 +5,15 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import Progress
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import copy_places, merge_maps, read_place_positions, shrink_map
+from edgevpr.places.examine import copy_places, merge_maps, shrink_map
 from edgevpr.places.mapfile import PlaceMap
 
 
@@ -43,9 +45,9 @@ def make_subset(
     ids_by_path: dict[Path, list[int]] = {}
     for path in _list_maps(source):
         with PlaceMap.open(path) as place_map:
-            place_ids, lat_deg, lon_deg = read_place_positions(place_map)
-            if near_ids := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
-                ids_by_path[path] = near_ids
+            place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.read_outlines())).reshape(-1, 4).T
+            if (is_near := shapely.contains_xy(ground, *project(lat_deg, lon_deg))).any():
+                ids_by_path[path] = place_ids[is_near].astype(int).tolist()
     paths, lost_calibration = list(ids_by_path), False
     with mapfiles.write_atomically(out) as temp_path, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         all_near, best_near = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.text import Progress, iterate_silently
 from edgevpr.core.types import Place, Position
@@ -32,12 +31,6 @@ class PlaceCheck(NamedTuple):
     problem: str | None
     content: Content
     is_usable: bool
-
-
-def read_place_positions(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
-    """Return the ids, int (N,), and the positions, float64 (N,) each, of the readable places; NaN: unknown."""
-    place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.read_outlines())).reshape(-1, 4).T
-    return place_ids.astype(int), lat_deg, lon_deg
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,13 +50,15 @@ def make_map_page(
     correct matches of each place that calibration queried, by place number. `look_alikes`: for each place searched, the
     one that looks alike (None: none). `pictures`: the map's album. `lens`: lens of its camera (None: unknown)."""
     ground = [place for place in places if place.position]
-    points = {place.place_id: to_point(place) for place in ground}
+    points = {place.place_id: to_point(place.position) for place in ground}
     tags_off_m, twins = measure_inconsistent_tags(ground), {twin.place_id: twin for twin in look_alikes if twin}
     hard = {place_id for place_id, confidence in mean_confidences.items() if confidence < _MAX_HARD_CONFIDENCE}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
     steps = list(_make_steps(places, mean_confidences, tags_off_m, twins, points))
     pairs = [(points.get(twin.place_id), points.get(twin.other_id)) for twin in twins.values()]
-    tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
+    tags = [
+        (to_point(place.recorded_position), points[place.place_id]) for place in ground if place.place_id in tags_off_m
+    ]
     layers = [
         Layer("coverage gaps", "gap", gaps, "area"),
         Layer("look alike", "alike", [(point, other) for point, other in pairs if point and other], "line"),
@@ -136,17 +138,11 @@ def _make_steps(
         )
 
 
-def read_recorded_position(place: Place) -> Point:
-    """Return the recorded position of a place, before refinement moved it."""
-    recorded = place.pose and place.pose.recorded
-    return (recorded.lat_deg, recorded.lon_deg) if recorded else to_point(place)
-
-
 def measure_inconsistent_tags(places: Sequence[Place]) -> dict[int, float]:
     """Return the distance in metres, by place number, from the recorded position of a place to its refined one, for the
     places with an inconsistent tag (see `find_inconsistent_tags`)."""
     moved_m = {
-        place.place_id: float(distance_m(*read_recorded_position(place), *to_point(place)))
+        place.place_id: float(distance_m(*to_point(place.recorded_position), *to_point(place.position)))
         for place in places
         if place.pose and place.pose.recorded
     }
@@ -160,8 +156,8 @@ def find_gaps(places: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     posed = [(place, place.pose) for place in places if place.pose]
     if not posed:
         return [], 0.0, 0.0
-    origin = to_point(posed[0][0])
-    centres_m = np.array([offset_m(*origin, *to_point(place)) for place, _ in posed])
+    origin = to_point(posed[0][0].position)
+    centres_m = np.array([offset_m(*origin, *to_point(place.position)) for place, _ in posed])
     footprint_m = float(np.median([pose.footprint_m for _, pose in posed]))
     low, high = centres_m.min(axis=0) - 2 * footprint_m, centres_m.max(axis=0) + 2 * footprint_m
     cell_m = max(footprint_m / _CELLS_PER_FOOTPRINT, float(np.sqrt(np.prod(high - low) / _MAX_CELLS)))

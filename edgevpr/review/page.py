@@ -78,7 +78,7 @@ def make_flight_page(
 def _make_layers(places: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, bottom layer first."""
     return [
-        Layer("places of the map", "places", [[to_point(place) for place in places]]),
+        Layer("places of the map", "places", [[to_point(place.position) for place in places]]),
         make_layer(steps, "places found", "found"),
         Layer("fixes between matches", "between", [list(filter(None, map(get_point, flight.between)))]),
         make_layer(steps, "GPS", "gps", "line"),

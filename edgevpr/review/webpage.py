@@ -15,7 +15,7 @@ import numpy as np
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import sanitize
-from edgevpr.core.types import Place
+from edgevpr.core.types import Place, Position
 from edgevpr.frames.level import Lens
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.review.album import Album, AlbumPicture, embed_pictures
@@ -103,10 +103,10 @@ def read_located_places(path: str | Path) -> list[Place]:
         return [place for place in place_map.read_places() if place.position]
 
 
-def to_point(place: Place) -> Point:
-    """Return the position (lat_deg, lon_deg) of a place that has one."""
-    assert place.position is not None
-    return place.position.lat_deg, place.position.lon_deg
+def to_point(position: Position | None) -> Point:
+    """Return a position, which must be known, as (lat_deg, lon_deg)."""
+    assert position is not None
+    return position.lat_deg, position.lon_deg
 
 
 def make_layer(steps: Sequence[Step], name: str, colour: str, form: Form = "dots") -> Layer:
@@ -198,7 +198,7 @@ class _Drawing:
         picture; None if they are unknown."""
         if not (place.pose and place.position):
             return None
-        return *self.convert(to_point(place)), round(place.pose.footprint_m, 2), round(place.pose.up_deg, 1)
+        return *self.convert(to_point(place.position)), round(place.pose.footprint_m, 2), round(place.pose.up_deg, 1)
 
 
 def _serialise_step(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -> dict[str, Any]:

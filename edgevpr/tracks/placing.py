@@ -124,14 +124,12 @@ def _estimate_zone_offset_s(track: Track, times_s: Doubles, label: str) -> float
     if fractions.max() < _MIN_FRACTION_IN_TRACK:
         raise UsageError(f"The track does not cover {label} in any time zone: {_format_spans(track, times_s)}")
     best_s = offsets_s[fractions == fractions.max()].tolist()
-    for unit_s in (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S):
-        candidates_s = sorted((offset_s for offset_s in best_s if offset_s % unit_s == 0), key=abs)
-        if len(candidates_s) > 1:
-            choices = ", ".join(f"{offset_s:g}" for offset_s in candidates_s[:4])
-            raise UsageError(f"The camera's clock may be off by {choices} s: pass one as --offset-s (0 if right).")
-        if candidates_s:
-            return float(candidates_s[0])
-    raise AssertionError("the smallest unit fits")
+    units_s = (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S)
+    candidates_s = next(filter(None, ([value_s for value_s in best_s if value_s % unit_s == 0] for unit_s in units_s)))
+    if len(candidates_s) > 1:
+        choices = ", ".join(f"{offset_s:g}" for offset_s in sorted(candidates_s, key=abs)[:4])
+        raise UsageError(f"The camera's clock may be off by {choices} s: pass one as --offset-s (0 if right).")
+    return float(candidates_s[0])
 
 
 def _format_spans(track: Track, times_s: Doubles) -> str:

@@ -159,11 +159,11 @@ def open_temporary_map(
             build_map(frames, FrameEncoder(technique=technique), place_map)
             pictures = FlightPictures(source=str(images)) if images else None
             encoder = make_encoder(SourceConfig(), pictures, technique)
-            finished = finish_map(place_map, encoder, MatchConfig(), pictures, show_progress)
+            *_, not_done = finish_map(place_map, encoder, MatchConfig(), pictures, show_progress)
         with PlaceMap.open(path) as place_map:
             index = load_index(place_map, technique)
             # Drop the name of the temporary folder, which is deleted afterwards and differs in every run.
-            yield place_map, index, tuple(sentence.replace(f"{folder}/", "") for sentence in finished.not_done)
+            yield place_map, index, tuple(sentence.replace(f"{folder}/", "") for sentence in not_done)
 
 
 def summarise(
@@ -288,7 +288,6 @@ class Measurements:
 
     def as_json(self) -> dict[str, Any]:
         """Return all results and answers, with date, machine and versions, for `json.dumps`."""
-        results = [(name, result) for name, results in self.measured.items() for result in results]
         return {
             **describe_origin(),
             "results": [
@@ -298,7 +297,8 @@ class Measurements:
                     **asdict(result),
                     "answers": list(map(_serialise_answer, self.answers[name, result.technique])),
                 }
-                for name, result in results
+                for name, results in self.measured.items()
+                for result in results
             ],
             "failed": [{"set": name, "row": row, "why": str(error)} for (name, row), error in self.failed.items()],
         }

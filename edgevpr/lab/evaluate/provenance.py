@@ -13,11 +13,6 @@ import edgevpr
 _PACKAGES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime": "onnxruntime", "scipy": "scipy"}
 
 
-def format_date() -> str:
-    """Return the date in UTC, like 2026-01-31."""
-    return datetime.now(timezone.utc).strftime("%Y-%m-%d")
-
-
 @cache
 def read_versions() -> dict[str, str | None]:
     """Return the versions of edgevpr, Python and the libraries that affect results; None if one is missing."""
@@ -46,5 +41,6 @@ def read_cpu_model() -> str:
 
 
 def describe_origin() -> dict[str, Any]:
-    """Return the date, machine and versions to store with a result."""
-    return {"date": format_date(), "machine": describe_machine(), "versions": read_versions()}
+    """Return the date in UTC (like 2026-01-31), the machine and the versions to store with a result."""
+    today = datetime.now(timezone.utc).date()
+    return {"date": today.isoformat(), "machine": describe_machine(), "versions": read_versions()}
