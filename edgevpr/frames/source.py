@@ -108,7 +108,7 @@ class FolderSource(RecordingSource):
         super().__init__(only)
         self._steps_s = iter(steps_s)
         paths = {decode_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
-        self._tags = _read_table(folder, positions)
+        self._tags = read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
             raise UsageError(f"{positions} lists none of the images in {folder}: correct the column `file`.")
         self._unread = [(name, path) for name, path in paths.items() if self.is_selected(name)][::-1]
@@ -133,7 +133,8 @@ class FolderSource(RecordingSource):
         return make_frame(image, name, self._clock(), self._tags.get(name) or read_exif(path))
 
 
-def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
+def read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
+    """Read the table of the positions of a folder of images; the tags, by file name, are empty if there is none."""
     csv_path = positions or find_positions(folder)
     return read_positions(csv_path) if csv_path else {}
 
@@ -141,7 +142,7 @@ def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
 def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
     """Return the tags of a folder's images, keyed by path, as a `FolderSource` with these `positions` would. Raises
     UsageError for an unusable table."""
-    tags = _read_table(folder, positions)
+    tags = read_table(folder, positions)
     return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 

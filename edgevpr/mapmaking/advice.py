@@ -25,8 +25,8 @@ from edgevpr.core.text import show_elapsed
 from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import OverlayMask
-from edgevpr.frames.positions import find_positions, find_track, read_positions, read_track
-from edgevpr.frames.source import Source, open_source, read_to_end
+from edgevpr.frames.positions import find_track, read_track
+from edgevpr.frames.source import Source, open_source, read_table, read_to_end
 from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
 from edgevpr.runtime.recognise.agreement import MIN_PROVEN_INLIERS, measure_agreement
@@ -70,8 +70,7 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
     the map (None: the map will not be calibrated)."""
     uri, has_position = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
     if pictures.folder:
-        table = pictures.positions or find_positions(uri)
-        tags = read_positions(table) if table else {}
+        tags = read_table(pictures.folder, pictures.positions)
         paths = [path for run in _choose_runs(pictures.folder) for path in run]
         has_position = any((tags.get(path.name) or read_exif(path)).position for path in paths)
     elif not pictures.rate_hz:
@@ -125,8 +124,7 @@ def require_level_camera(pictures: FlightPictures, fov_deg: float | None) -> Non
     angles are not recorded, because the pictures then cannot be levelled."""
     if pictures.folder:
         paths = [path for run in _choose_runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
-        table = pictures.positions or find_positions(pictures.source)
-        tags = read_positions(table) if table else {}
+        tags = read_table(pictures.folder, pictures.positions)
         if any(tag.pitch_deg is not None for path in paths for tag in (tags.get(path.name), read_xmp(path)) if tag):
             return
         tilt = measure_tilt(_read_usable(paths), fov_deg)

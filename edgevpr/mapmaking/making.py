@@ -94,20 +94,16 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
         warn_of_mismatch(place_map, mask, lens)
     with place_map:
         try:
+            frames: Iterator[Frame] = filter(None, progress(read_to_end(source, on_error), source.total, "mapping"))
             if isinstance(pictures, FlightPictures):
                 will_calibrate = plan.calibrate and list_evidence_kinds(technique.spec)
                 advice.warn_of_gaps(pictures, source.total, len(place_map) if will_calibrate else None)
                 advice.suggest_lens(pictures, source_config, technique)
                 advice.warn_of_display(pictures, mask)
+                if technique.spec.looks_down and (camera := read_camera_lens(source_config)):
+                    frames = find_headings(frames, camera)
             else:
                 place_map.add_attribution(pictures.attribution)
-            frames: Iterator[Frame] = filter(None, progress(read_to_end(source, on_error), source.total, "mapping"))
-            if (
-                technique.spec.looks_down
-                and isinstance(pictures, FlightPictures)
-                and (camera := read_camera_lens(source_config))
-            ):
-                frames = find_headings(frames, camera)
             encoder = make_encoder(source_config, pictures, technique)
             result = build_map(
                 frames,
