@@ -7,20 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import (
-    add_command,
-    add_group,
-    add_json,
-    add_keys,
-    add_known,
-    add_positions,
-    add_recording,
-    make_config,
-    print_result,
-    report_unusable,
-    skip_image,
-    to_path,
-)
+from edgevpr.cli import shared
 from edgevpr.core.config import resolve_log_paths
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
@@ -39,34 +26,36 @@ _MATCHING_KEYS = (
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    match = add_command(commands, "match", run_match, "look up images in a map, offline")
+    match = shared.add_command(commands, "match", run_match, "look up images in a map, offline")
     match.add_argument("map", metavar="MAP")
-    add_recording(match)
+    shared.add_recording(match)
     match.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
-    add_keys(match, *_MATCHING_KEYS)
+    shared.add_keys(match, *_MATCHING_KEYS)
     match.add_argument("--follow", action="store_true", help="treat the images as one flight, in order (cohog only)")
-    add_known(match)
-    add_json(match)
+    shared.add_known(match)
+    shared.add_json(match)
 
-    run = add_command(commands, "run", run_flight, "recognise places in flight and send positions to the autopilot")
+    run = shared.add_command(
+        commands, "run", run_flight, "recognise places in flight and send positions to the autopilot"
+    )
     run.add_argument("--config", metavar="FILE", help="configuration file (YAML); flags override it")
-    add_keys(run)
-    add_positions(run)
+    shared.add_keys(run)
+    shared.add_positions(run)
 
-    check = add_command(commands, "check", run_check, "check a configuration before flight")
+    check = shared.add_command(commands, "check", run_check, "check a configuration before flight")
     check.add_argument("--config", required=True, metavar="FILE")
     check.add_argument("--offline", action="store_true", help="do not wait for a frame or a heartbeat")
-    add_json(check)
+    shared.add_json(check)
 
-    services = add_group(commands, "service", "print the systemd unit")
-    unit = add_command(services, "print", run_service_print, "print the systemd unit")
+    services = shared.add_group(commands, "service", "print the systemd unit")
+    unit = shared.add_command(services, "print", run_service_print, "print the systemd unit")
     unit.add_argument("--board", default="this", metavar="NAME", help="board of the unit (default: this computer)")
 
     text = "check the autopilot's parameters and this computer (read-only)"
-    doctor = add_command(commands, "doctor", run_doctor, text)
+    doctor = shared.add_command(commands, "doctor", run_doctor, text)
     doctor.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
-    add_keys(doctor, "mavlink.link")
-    add_json(doctor)
+    shared.add_keys(doctor, "mavlink.link")
+    shared.add_json(doctor)
 
 
 def run_match(args: Namespace) -> int:
@@ -80,21 +69,21 @@ def run_match(args: Namespace) -> int:
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.techniques.card import describe_weights
 
-    config, known_fields = make_config(args, args.config, map=args.map), parse_known_fields(args.known)
+    config, known_fields = shared.make_config(args, args.config, map=args.map), parse_known_fields(args.known)
     board = resolve_board(load_board(config.board), config.source, config.memory)
     recogniser = open_recogniser(config, board, known=known_fields, tracks_flight=args.follow)
     matches = []
     unusable: list[ImageError] = []
-    source = open_source(args.source, positions=to_path(args.positions), live=False)
+    source = open_source(args.source, positions=shared.to_path(args.positions), live=False)
     if known_fields:
         _require_known(args, known_fields, recogniser)
-    frames = read_to_end(source, lambda error: skip_image(error, unusable))
+    frames = read_to_end(source, lambda error: shared.skip_image(error, unusable))
     place_map = recogniser.place_map
     is_calibrated = place_map.calibration is not None
     for frame in filter(None, progress(frames, source.total, "matching")):
         event = recogniser.step(frame)
         if event.failed:
-            skip_image(ImageError(f"{frame.name}: {event.reason}"), unusable)
+            shared.skip_image(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         matches.append(format_match(event) | {"calibrated": is_calibrated})
         if known_fields:
@@ -106,8 +95,8 @@ def run_match(args: Namespace) -> int:
         lines.append(f"Known for each query: {','.join(known_fields)}.")
     if weights := describe_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
-    print_result(matches, args.json, "\n".join(lines))
-    return report_unusable(unusable)
+    shared.print_result(matches, args.json, "\n".join(lines))
+    return shared.report_unusable(unusable)
 
 
 def _require_known(args: Namespace, fields: Sequence[str], recogniser: "Recogniser") -> None:
@@ -116,7 +105,7 @@ def _require_known(args: Namespace, fields: Sequence[str], recogniser: "Recognis
     from edgevpr.frames.source import read_tags
     from edgevpr.runtime.recognise.hints import explain_why_unusable
 
-    source, positions = Path(args.source), to_path(args.positions)
+    source, positions = Path(args.source), shared.to_path(args.positions)
     if source.is_dir():
         queries = list(read_tags(source, positions).values())
     else:
@@ -130,9 +119,9 @@ def run_flight(args: Namespace) -> int:
     """Run `run`: run a flight with a configuration until it ends."""
     from edgevpr.runtime.flight.flight import fly
 
-    config = make_config(args, args.config)
+    config = shared.make_config(args, args.config)
     log = resolve_log_paths(config.log, os.environ.get("LOGS_DIRECTORY", ""))
-    return fly(replace(config, log=log), to_path(args.positions))
+    return fly(replace(config, log=log), shared.to_path(args.positions))
 
 
 def run_check(args: Namespace) -> int:
@@ -147,7 +136,7 @@ def run_doctor(args: Namespace) -> int:
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import check_setup
 
-    config = make_config(args, args.config)
+    config = shared.make_config(args, args.config)
     if config.mavlink.link is None:
         raise UsageError("No link to the autopilot is configured: pass one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
@@ -160,7 +149,7 @@ def _show_findings(findings: "Sequence[Finding]", as_json: bool, **extra_fields:
     from edgevpr.runtime.service.finding import format_findings
 
     is_ok, fields = all(finding.ok for finding in findings), [finding.fields() for finding in findings]
-    print_result({**extra_fields, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
+    shared.print_result({**extra_fields, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
     return max(finding.exit_code for finding in findings)
 
 

@@ -8,19 +8,7 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import (
-    add_command,
-    add_group,
-    add_json,
-    add_keys,
-    add_known,
-    add_parameters,
-    make_config,
-    parse_parameters,
-    parse_positive,
-    print_notes,
-    print_result,
-)
+from edgevpr.cli import shared
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import progress, sanitize
@@ -38,10 +26,10 @@ _NUMBER_FLAGS: dict[str, tuple[float | None, float, float, str]] = {
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    _add_eval(add_command(commands, "eval", run_eval, "evaluate techniques on data sets with ground truth"))
-    simulations = add_group(commands, "simulate", "generate the images of flights")
+    _add_eval(shared.add_command(commands, "eval", run_eval, "evaluate techniques on data sets with ground truth"))
+    simulations = shared.add_group(commands, "simulate", "generate the images of flights")
     text = "generate the images and positions.csv of a flight"
-    flight = add_command(simulations, "flight", run_simulate_flight, text)
+    flight = shared.add_command(simulations, "flight", run_simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
     flight.add_argument("--which", choices=("map", "query"), help="map (default): mapping flight; query: later flight")
     text = "random seed for the landscape and motion (default: 1)"
@@ -53,7 +41,9 @@ def add(commands: Any) -> None:
     )
     for name, (*_, text) in _NUMBER_FLAGS.items():
         orthophoto.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
-    demo = add_command(commands, "demo", run_demo, "map a generated flight, match a later one, and draw the result")
+    demo = shared.add_command(
+        commands, "demo", run_demo, "map a generated flight, match a later one, and draw the result"
+    )
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
 
@@ -63,19 +53,19 @@ def _add_eval(parser: ArgumentParser) -> None:
     parser.add_argument("--ref", metavar="FOLDER", help="folder of reference images")
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (default: see --within-m)")
     text = "references within this distance of a query, in metres, are correct (default: 25)"
-    parser.add_argument("--within-m", type=parse_positive, default=25.0, metavar="M", help=text)
+    parser.add_argument("--within-m", type=shared.parse_positive, default=25.0, metavar="M", help=text)
     text = f"vector formats to evaluate: {', '.join(FORMS)} (default: float)"
     parser.add_argument("--form", default="float", metavar="A,B", help=text)
     parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
     parser.add_argument("--follow", action="store_true", help="treat the queries as one flight, in order (cohog only)")
-    add_known(parser)
+    shared.add_known(parser)
     text = "configuration file; its sections `salience` and `match` are used"
     parser.add_argument("--config", metavar="FILE", help=text)
-    add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
+    shared.add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
     text = "techniques to evaluate (default: hog,cohog)"
     parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help=text)
-    add_parameters(parser, "set a parameter of a technique", "TECHNIQUE.KEY=VALUE")
-    add_json(parser)
+    shared.add_parameters(parser, "set a parameter of a technique", "TECHNIQUE.KEY=VALUE")
+    shared.add_json(parser)
 
 
 def run_eval(args: Namespace) -> int:
@@ -83,7 +73,7 @@ def run_eval(args: Namespace) -> int:
     from edgevpr.lab.evaluate.evaluate import MatchOptions, measure
     from edgevpr.lab.evaluate.tables import format_results
 
-    config, rows, sets = make_config(args, args.config), _list_rows(args), _open_sets(args)
+    config, rows, sets = shared.make_config(args, args.config), _list_rows(args), _open_sets(args)
     options = MatchOptions(
         candidates=config.match.candidates,
         sequence=config.match.sequence,
@@ -100,8 +90,10 @@ def run_eval(args: Namespace) -> int:
     tables = [
         f"{sanitize(name)}\n\n{format_results(results)}\n" for name, results in outcome.measured.items() if results
     ]
-    print_result(content, args.json, "\n".join(tables))
-    print_notes(*(f"{row} was not evaluated on {name}: {error}" for (name, row), error in outcome.failed.items()))
+    shared.print_result(content, args.json, "\n".join(tables))
+    shared.print_notes(
+        *(f"{row} was not evaluated on {name}: {error}" for (name, row), error in outcome.failed.items())
+    )
     return 1 if outcome.failed else 0
 
 
@@ -137,15 +129,15 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
         raise UsageError(f"--form has an unknown value `{unknown[0]}`: choose from {', '.join(FORMS)}.")
-    camera = make_config(args).source.camera
+    camera = shared.make_config(args).source.camera
     settings = {name: make_camera_setting(name, camera) for name in names}
-    for key, value in parse_parameters(args.param).items():
+    for key, value in shared.parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:
             raise UsageError(f"--param {key} must be TECHNIQUE.KEY=VALUE, with a technique from --techniques.")
         settings[name][parameter] = value
     if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in names):
-        print_notes("assuming that the camera faces ahead: pass `--camera nadir` if it faces straight down")
+        shared.print_notes("assuming that the camera faces ahead: pass `--camera nadir` if it faces straight down")
     rows = {}
     for name in names:
         has_forms = "form" in techniques.read_parameters(name) and "form" not in settings[name]

@@ -7,27 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import (
-    Run,
-    add_command,
-    add_group,
-    add_json,
-    add_keys,
-    add_map_images,
-    add_parameters,
-    add_recording,
-    check_output,
-    describe_lost_calibration,
-    format_fields,
-    make_config,
-    parse_parameters,
-    parse_positive,
-    print_result,
-    report_unusable,
-    skip_image,
-    to_path,
-    write_output,
-)
+from edgevpr.cli import shared
 from edgevpr.cli.wording import format_build, format_check, format_info, format_move, format_refinement
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
@@ -42,10 +22,10 @@ _MISSION_MARGIN_M = 500.0
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = add_group(commands, "map", "build, refine, calibrate, inspect, check, repair, merge and cut maps")
+    maps = shared.add_group(commands, "map", "build, refine, calibrate, inspect, check, repair, merge and cut maps")
 
-    def add_to_map(name: str, run: Run, text: str, map_help: str = "") -> ArgumentParser:
-        parser = add_command(maps, name, run, text)
+    def add_to_map(name: str, run: shared.Run, text: str, map_help: str = "") -> ArgumentParser:
+        parser = shared.add_command(maps, name, run, text)
         parser.add_argument("map", metavar="MAP", help=map_help or None)
         return parser
 
@@ -53,46 +33,48 @@ def add(commands: Any) -> None:
     _add_build(build)
     refine = add_to_map("refine", run_map_refine, "refine the positions of the places by matching their images")
     refine.add_argument("--images", metavar="DIR", help="images that the map was built from")
-    add_json(refine)
+    shared.add_json(refine)
     move = add_to_map("move", run_map_move, "shift a map by the offset from GPS that a flight measured")
     move.add_argument("--by", metavar="LOG", required=True, help="log of a flight with this map and with GPS")
-    add_json(move)
+    shared.add_json(move)
     calibrate = add_to_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
     calibrate.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and precision are used)")
-    add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
-    add_json(calibrate)
+    shared.add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
+    shared.add_json(calibrate)
     info = add_to_map("info", run_map_info, "print what a map contains, or write it as an HTML page")
     info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
-    add_map_images(info)
+    shared.add_map_images(info)
     info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (only its lens)")
-    add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
-    add_json(info)
-    add_json(add_to_map("check", run_map_check, "read the whole map and report what is damaged"))
-    add_json(add_to_map("repair", run_map_repair, "remove damaged places; keep the original as MAP.damaged"))
-    merge = add_command(maps, "merge", run_map_merge, "merge maps of the same technique")
+    shared.add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
+    shared.add_json(info)
+    shared.add_json(add_to_map("check", run_map_check, "read the whole map and report what is damaged"))
+    shared.add_json(add_to_map("repair", run_map_repair, "remove damaged places; keep the original as MAP.damaged"))
+    merge = shared.add_command(maps, "merge", run_map_merge, "merge maps of the same technique")
     merge.add_argument("out", metavar="OUT", help="map to write")
     merge.add_argument("maps", metavar="MAP", nargs="+")
-    add_json(merge)
+    shared.add_json(merge)
     _add_subset(add_to_map("subset", run_map_subset, "cut out the part that a mission needs", "map, or folder of maps"))
-    salience = add_command(commands, "salience", run_salience, "print how memorable an image is")
+    salience = shared.add_command(commands, "salience", run_salience, "print how memorable an image is")
     salience.add_argument("image", metavar="IMAGE")
     salience.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
-    add_json(salience)
+    shared.add_json(salience)
 
 
 def _add_build(build: ArgumentParser) -> None:
     _add_pictures(build)
     build.add_argument("--technique", metavar="NAME", help="technique (default: cohog)")
-    add_parameters(build, "set a parameter of the technique")
+    shared.add_parameters(build, "set a parameter of the technique")
     build.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and salience are used)")
-    add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
-    build.add_argument("--rate-hz", type=parse_positive, metavar="HZ", help="places per second of a video")
+    shared.add_keys(
+        build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use"
+    )
+    build.add_argument("--rate-hz", type=shared.parse_positive, metavar="HZ", help="places per second of a video")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="keep the recorded positions")
     build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="skip the confidence calibration")
     build.add_argument("--attribution", metavar="TEXT", help="attribution that the orthophoto's licence requires")
     build.add_argument("--append", action="store_true", help="add to an existing map, or resume an interrupted build")
-    add_json(build)
+    shared.add_json(build)
 
 
 def _add_subset(parser: ArgumentParser) -> None:
@@ -105,18 +87,20 @@ def _add_subset(parser: ArgumentParser) -> None:
     parser.add_argument("--out", metavar="MAP", required=True, help="map to write")
     parser.add_argument(
         "--margin-m",
-        type=parse_positive,
+        type=shared.parse_positive,
         metavar="M",
         default=_MISSION_MARGIN_M,
         help="margin around the mission in metres (default: %(default)g)",
     )
-    parser.add_argument("--mb", type=parse_positive, metavar="MB", help="maximum file size in MB (default: no limit)")
-    add_json(parser)
+    parser.add_argument(
+        "--mb", type=shared.parse_positive, metavar="MB", help="maximum file size in MB (default: no limit)"
+    )
+    shared.add_json(parser)
 
 
 def _add_pictures(parser: ArgumentParser) -> None:
     """Add the flags for the pictures of a map: those for a recording and those for an orthophoto."""
-    add_recording(parser, required=False)
+    shared.add_recording(parser, required=False)
     flags = parser.add_argument_group("from an orthophoto, instead of --images")
     flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT or MBTiles file")
     flags.add_argument(
@@ -158,7 +142,7 @@ def _parse_pictures(args: Namespace) -> "FlightPictures | OrthophotoGrid":
         raise UsageError(f"--{misplaced[0].replace('_', '-')} applies only to {source}: leave it out.")
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
-        return FlightPictures(source=args.source, positions=to_path(args.positions), rate_hz=rate_hz)
+        return FlightPictures(source=args.source, positions=shared.to_path(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     options: dict[str, Any] = {name: getattr(args, name, None) for name in _ORTHOPHOTO_FLAGS}
@@ -169,18 +153,18 @@ def run_map_build(args: Namespace) -> int:
     """Run `map build`: build a map from a recording or an orthophoto, or add to an existing map."""
     from edgevpr.mapmaking.making import MapPlan, make_map
 
-    config = make_config(args, args.config)
+    config = shared.make_config(args, args.config)
     plan = MapPlan(
         path=args.map,
         pictures=_parse_pictures(args),
         technique=args.technique,
-        parameters=parse_parameters(args.param),
+        parameters=shared.parse_parameters(args.param),
         append=args.append,
         refine=args.refine,
         calibrate=args.calibrate,
     )
     unusable: list[ImageError] = []
-    built_map = make_map(plan, config, lambda error: skip_image(error, unusable), progress)
+    built_map = make_map(plan, config, lambda error: shared.skip_image(error, unusable), progress)
     parts = {
         "covered": built_map.covered and asdict(built_map.covered),
         "refined": built_map.refined and asdict(built_map.refined),
@@ -189,8 +173,8 @@ def run_map_build(args: Namespace) -> int:
     }
     fields = {"map": args.map, "technique": built_map.technique, "places": built_map.places, **asdict(built_map.result)}
     fields |= {name: part for name, part in parts.items() if part}
-    print_result(fields, args.json, format_build(args.map, built_map, args.orthophoto is not None))
-    return report_unusable(unusable)
+    shared.print_result(fields, args.json, format_build(args.map, built_map, args.orthophoto is not None))
+    return shared.report_unusable(unusable)
 
 
 def run_map_refine(args: Namespace) -> None:
@@ -201,7 +185,7 @@ def run_map_refine(args: Namespace) -> None:
 
     with PlaceMap.open_for_writing(args.map) as place_map:
         refined = refine_map(place_map, create_technique(place_map), args.images, progress)
-    print_result({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
+    shared.print_result({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
 
 
 def run_map_move(args: Namespace) -> None:
@@ -211,7 +195,7 @@ def run_map_move(args: Namespace) -> None:
 
     with PlaceMap.open_for_writing(args.map) as place_map:
         move = move_map(place_map, args.by)
-    print_result({"map": args.map, **asdict(move)}, args.json, format_move(args.map, move))
+    shared.print_result({"map": args.map, **asdict(move)}, args.json, format_move(args.map, move))
 
 
 def run_map_calibrate(args: Namespace) -> None:
@@ -220,12 +204,12 @@ def run_map_calibrate(args: Namespace) -> None:
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 
-    config, pictures = make_config(args, args.config), _parse_pictures(args)
+    config, pictures = shared.make_config(args, args.config), _parse_pictures(args)
     with PlaceMap.open_for_writing(args.map) as place_map:
         encoder = make_encoder(config.source, pictures, create_technique(place_map))
         calibration = calibrate_map(place_map, encoder, config.match, pictures, progress)
     fields = {"map": args.map, "calibration": calibration.figures()}
-    print_result(fields, args.json, [f"{args.map}: calibrated: {calibration.describe()}"])
+    shared.print_result(fields, args.json, [f"{args.map}: calibrated: {calibration.describe()}"])
 
 
 def run_map_info(args: Namespace) -> None:
@@ -237,7 +221,7 @@ def run_map_info(args: Namespace) -> None:
     from edgevpr.techniques import CONFIDENCE_TECHNIQUE
 
     if args.page:
-        check_output(args.page, args.map)
+        shared.check_output(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
         info, calibration = describe_map(place_map), read_calibration_for(place_map)
     place_bytes = compute_place_bytes(info.spec)
@@ -248,7 +232,7 @@ def run_map_info(args: Namespace) -> None:
     ram_mb = info.places * place_bytes / 1e6
     figures = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
     lines = list(format_info(info, confidence, ram_mb))
-    print_result({**asdict(info), **figures, "ram_mb": ram_mb}, args.json, lines)
+    shared.print_result({**asdict(info), **figures, "ram_mb": ram_mb}, args.json, lines)
     if args.page:
         _write_page(args, lines, calibration.recognisable if calibration else {})
 
@@ -261,7 +245,7 @@ def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, fl
     from edgevpr.review.mappage import MAX_QUERIES, make_map_page
     from edgevpr.runtime.recognise.levelling import read_camera_lens
 
-    lens = read_camera_lens(make_config(args, args.config).source)
+    lens = read_camera_lens(shared.make_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
         places = list(place_map.read_places())
         pictures = make_map_album(args.map_images, places)
@@ -274,7 +258,7 @@ def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, fl
         look_alikes = list(find_look_alikes(place_map, queries))
     name = Path(args.map).name
     page = make_map_page(name, lines, places, recognisable, look_alikes, pictures, lens)
-    write_output(args.page, args.map, page)
+    shared.write_output(args.page, args.map, page)
     if not args.json:
         print(f"{args.page}: {len(places)} places of {args.map}")
 
@@ -284,7 +268,7 @@ def run_map_check(args: Namespace) -> int:
     from edgevpr.places.examine import check_map
 
     result = check_map(args.map, progress)
-    print_result({**asdict(result), "is_whole": result.is_intact}, args.json, format_check(result))
+    shared.print_result({**asdict(result), "is_whole": result.is_intact}, args.json, format_check(result))
     return 0 if result.is_intact else 1
 
 
@@ -298,7 +282,7 @@ def run_map_repair(args: Namespace) -> None:
     fields = {"path": args.map, "kept": result.places, "dropped": dropped, "original": original and str(original)}
     repaired = f"{args.map}: repaired, {result.places} places kept, {dropped} removed; the original is now {original}"
     text = "no damage: the map is unchanged" if original is None else repaired
-    print_result(fields, args.json, [*format_check(result), text])
+    shared.print_result(fields, args.json, [*format_check(result), text])
 
 
 def run_map_merge(args: Namespace) -> None:
@@ -314,8 +298,8 @@ def run_map_merge(args: Namespace) -> None:
     merged = {"map": args.out, "places": sum(copied for copied, _ in counts), "of": parts}
     text = [f"{part['map']}: {part['copied']} places copied, {part['already_here']} already there" for part in parts]
     text.append(f"{args.out}: {merged['places']} places")
-    text += describe_lost_calibration(args.out, were_calibrated)
-    print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
+    text += shared.describe_lost_calibration(args.out, were_calibrated)
+    shared.print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
 
 
 def run_map_subset(args: Namespace) -> None:
@@ -327,8 +311,8 @@ def run_map_subset(args: Namespace) -> None:
     area, out = read_area(args.mission), parse_map_path(args.out)
     result = make_subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
     fields = {"map": str(out), **asdict(result)}
-    text = [*format_fields(fields), *describe_lost_calibration(str(out), result.lost_calibration)]
-    print_result(fields, args.json, text)
+    text = [*shared.format_fields(fields), *shared.describe_lost_calibration(str(out), result.lost_calibration)]
+    shared.print_result(fields, args.json, text)
 
 
 def run_salience(args: Namespace) -> None:
@@ -337,8 +321,8 @@ def run_salience(args: Namespace) -> None:
     from edgevpr.runtime.recognise.opening import open_salience_gate
     from edgevpr.runtime.recognise.salience_gate import judge_scores
 
-    gate = open_salience_gate(make_config(args, args.config, **{"salience.use": True}).salience)
+    gate = open_salience_gate(shared.make_config(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
     judgement = judge_scores(gate.scores(read_image(Path(args.image))), gate.config)
     outcome = {"kept": judgement.reason is None, "reason": judgement.reason and judgement.reason.fields()}
-    print_result({"image": args.image, **asdict(judgement.scores), **outcome}, args.json)
+    shared.print_result({"image": args.image, **asdict(judgement.scores), **outcome}, args.json)
