@@ -117,11 +117,12 @@ def _open_sets(args: Namespace) -> "dict[str, Dataset]":
     return sets
 
 
-def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
+def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, Any]]]:
     """Return the rows requested by the flags, for `measure`: each technique in each form. Raises UsageError for an
     unknown form, and for a --param of a technique that is not in --techniques."""
     from edgevpr import techniques
     from edgevpr.runtime.preflight.pick import make_camera_setting
+    from edgevpr.runtime.preflight.trial import list_trials
 
     names = [name.strip() for name in args.techniques.split(",") if name.strip()]
     if not names:
@@ -138,13 +139,7 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
         settings[name][parameter] = value
     if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in names):
         shared.print_notes("assuming that the camera faces ahead: pass `--camera nadir` if it faces straight down")
-    rows = {}
-    for name in names:
-        has_forms = "form" in techniques.read_parameters(name) and "form" not in settings[name]
-        for form in forms if has_forms else [None]:
-            row_settings = {**settings[name], "form": form} if form else settings[name]
-            rows[techniques.format_name(name, row_settings.get("form"))] = name, row_settings
-    return rows
+    return {trial.label: (trial.name, trial.settings) for trial in list_trials(settings, forms)}
 
 
 def _parse_seed(text: str) -> int:

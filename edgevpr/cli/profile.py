@@ -2,16 +2,10 @@
 
 from argparse import Namespace
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from edgevpr.cli.shared import add_command, add_json, add_keys, make_config, parse_count, parse_positive, print_result
-from edgevpr.core.config import Config
 from edgevpr.core.text import progress
-
-if TYPE_CHECKING:
-    from edgevpr.power.boards import Board
-    from edgevpr.runtime.preflight.choose import FlightPlan
-    from edgevpr.runtime.preflight.trial import Trial
 
 
 def add(commands: Any) -> None:
@@ -32,11 +26,17 @@ def add(commands: Any) -> None:
 
 
 def run_profile(args: Namespace) -> None:
-    """Run `profile`: estimate the cost of techniques in a flight, or list the boards that have a profile."""
+    """Run `profile`: estimate the cost of techniques in a flight, in all their forms, or list the boards that have a
+    profile. With --map, only the technique of the map is tried."""
+    from edgevpr import techniques
+    from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.boards import list_boards, load_board, resolve_board
+    from edgevpr.power.equations import parse_pack
+    from edgevpr.runtime.preflight.choose import FlightPlan
     from edgevpr.runtime.preflight.estimate import estimate_flight
+    from edgevpr.runtime.preflight.pick import make_camera_setting
     from edgevpr.runtime.preflight.presentation import format_table
-    from edgevpr.runtime.preflight.trial import run_trials
+    from edgevpr.runtime.preflight.trial import list_trials, run_trials
 
     if args.list:
         for name in ("this", *list_boards()):
@@ -44,21 +44,6 @@ def run_profile(args: Namespace) -> None:
         return
     config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
-    plan, trials = _make_plan(args, config, board)
-    results = progress(run_trials(trials, board.threads), len(trials), "running techniques")
-    estimate = estimate_flight(board, results, plan)
-    print_result(estimate, args.json, format_table(estimate))
-
-
-def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
-    """Return the plan of the flight, and the techniques to try in all their forms: that of --map, or all of them."""
-    from edgevpr import techniques
-    from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.power.equations import parse_pack
-    from edgevpr.runtime.preflight.choose import FlightPlan
-    from edgevpr.runtime.preflight.pick import make_camera_setting
-    from edgevpr.runtime.preflight.trial import list_trials
-
     places, camera = args.places, config.source.camera
     settings: dict[str, Mapping[str, Any]]
     if args.map:
@@ -77,4 +62,7 @@ def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[Flight
         budget_mb=board.budget_mb,
         camera=camera,
     )
-    return plan, list_trials(tuple(settings), settings)
+    trials = list_trials(settings)
+    results = progress(run_trials(trials, board.threads), len(trials), "running techniques")
+    estimate = estimate_flight(board, results, plan)
+    print_result(estimate, args.json, format_table(estimate))

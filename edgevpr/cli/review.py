@@ -3,14 +3,11 @@ on the ground."""
 
 from argparse import Namespace
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from edgevpr.cli.shared import add_command, add_json, add_map_images, print_result, write_output
 from edgevpr.cli.wording import format_replay
 from edgevpr.core.errors import EdgevprError
-
-if TYPE_CHECKING:
-    from edgevpr.core.types import Place
 
 
 def add(commands: Any) -> None:
@@ -35,6 +32,7 @@ def add(commands: Any) -> None:
 
 def run_report(args: Namespace) -> None:
     """Run `report`: write the HTML page of a flight."""
+    from edgevpr.core.types import Place
     from edgevpr.review.album import make_album, make_map_album
     from edgevpr.review.logged import get_text, read_flight
     from edgevpr.review.page import make_flight_page

@@ -1,17 +1,9 @@
 """Code shared by the commands: flags, the configuration made from them, and the printing of results and errors."""
 
+import argparse
 import json
 import re
 import sys
-from argparse import (
-    SUPPRESS,
-    Action,
-    ArgumentError,
-    ArgumentParser,
-    ArgumentTypeError,
-    Namespace,
-    RawDescriptionHelpFormatter,
-)
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, is_dataclass
@@ -24,7 +16,7 @@ from edgevpr.core.config import Config, list_keys, load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import sanitize, suggest
 
-Run = Callable[[Namespace], int | None]  # runs a command with its arguments; returns its exit code (None: 0)
+Run = Callable[[argparse.Namespace], int | None]  # runs a command with its arguments; returns its exit code (None: 0)
 _PREFIX = "key "  # prefix of `Namespace` attributes that hold configuration keys
 _HELP_COLUMNS = 78
 _UNITS = {
@@ -32,7 +24,7 @@ _UNITS = {
 }  # fmt: skip
 
 
-class Parser(ArgumentParser):
+class Parser(argparse.ArgumentParser):
     """Parser of a command. The error for an invalid choice suggests a similar one. Arguments that begin as a negative
     number, as in `--area -35.36,149.16,500`, are values, not flags."""
 
@@ -40,18 +32,18 @@ class Parser(ArgumentParser):
         super().__init__(*args, **kwargs)
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
-    def _check_value(self, action: Action, value: Any) -> None:
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices and (hint := suggest(value, action.choices, "")):
-            raise ArgumentError(action, f"invalid choice: {value!r}; {hint}")
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r}; {hint}")
         super()._check_value(action, value)
 
 
-def add_command(commands: Any, name: str, run: Run, text: str) -> ArgumentParser:
+def add_command(commands: Any, name: str, run: Run, text: str) -> argparse.ArgumentParser:
     """Add a command and return its parser. `text` is the command's help."""
     parser = _add_parser(commands, name, text)
     parser.set_defaults(run=run, parser=parser)
     parser.epilog = format_examples(parser.prog.partition(" ")[2])
-    parser.formatter_class = RawDescriptionHelpFormatter
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     return parser
 
 
@@ -60,28 +52,28 @@ def add_group(commands: Any, name: str, text: str) -> Any:
     return _add_parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
 
 
-def _add_parser(commands: Any, name: str, text: str) -> ArgumentParser:
+def _add_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     description = "\n".join(wrap(text[0].upper() + text[1:] + ".", _HELP_COLUMNS))
-    parser: ArgumentParser = commands.add_parser(name, help=text, description=description)
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=description)
     # Accepted after the command too, where users type them.
-    parser.add_argument("-v", "--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
-    parser.add_argument("-q", "--quiet", action="store_true", default=SUPPRESS, help=SUPPRESS)
+    parser.add_argument("-v", "--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    parser.add_argument("-q", "--quiet", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     return parser
 
 
-def add_json(parser: ArgumentParser) -> None:
+def add_json(parser: argparse.ArgumentParser) -> None:
     """Add the flag --json."""
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def add_recording(parser: ArgumentParser, required: bool = True) -> None:
+def add_recording(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Add the flags for the folder of images or the video, and for its positions."""
     text = "folder of images, or video file"
     parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=text)
     add_positions(parser)
 
 
-def add_positions(parser: ArgumentParser) -> None:
+def add_positions(parser: argparse.ArgumentParser) -> None:
     """Add the flag for the positions of a folder of images or a video."""
     parser.add_argument(
         "--positions",
@@ -91,7 +83,7 @@ def add_positions(parser: ArgumentParser) -> None:
     )
 
 
-def add_map_images(parser: ArgumentParser) -> None:
+def add_map_images(parser: argparse.ArgumentParser) -> None:
     """Add the flag for the pictures that a map was built from, for pages that show them."""
     parser.add_argument(
         "--map-images",
@@ -102,7 +94,7 @@ def add_map_images(parser: ArgumentParser) -> None:
     )
 
 
-def add_known(parser: ArgumentParser) -> None:
+def add_known(parser: argparse.ArgumentParser) -> None:
     """Add the flag for prior knowledge about recorded queries; `hints.parse_known_fields` parses its value."""
     parser.add_argument(
         "--known",
@@ -112,12 +104,12 @@ def add_known(parser: ArgumentParser) -> None:
     )
 
 
-def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
+def add_parameters(parser: argparse.ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
     """Add the repeatable flag --param for parameters of a technique. `text` is its help."""
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
 
 
-def add_keys(parser: ArgumentParser, *names: str) -> None:
+def add_keys(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add the flags of the configuration keys `names`, such as "source.mask" (no names: the flags of all keys)."""
     for key in list_keys():
         if not key.flags or (names and key.name not in names):
@@ -128,7 +120,7 @@ def add_keys(parser: ArgumentParser, *names: str) -> None:
         parser.add_argument(*key.flags, dest=_PREFIX + key.name, help=key.text, **form)
 
 
-def make_config(args: Namespace, path: str | None = None, **overrides: Any) -> Config:
+def make_config(args: argparse.Namespace, path: str | None = None, **overrides: Any) -> Config:
     """Make the configuration from the file `path` (None: the defaults). Flags override the file, and `overrides`
     (values by configuration key) override both."""
     flags = {name.removeprefix(_PREFIX): value for name, value in vars(args).items() if name.startswith(_PREFIX)}
@@ -212,19 +204,19 @@ def print_notes(*sentences: str) -> None:
 
 
 def parse_positive(text: str) -> float:
-    """Parse a finite number above zero; the `type` of a flag. Raises ArgumentTypeError for any other text."""
+    """Parse a finite number above zero; the `type` of a flag. Raises argparse.ArgumentTypeError for any other text."""
     with suppress(ValueError):
         if 0 < (value := float(text)) < float("inf"):
             return value
-    raise ArgumentTypeError(f"`{text}` is not a number above 0")
+    raise argparse.ArgumentTypeError(f"`{text}` is not a number above 0")
 
 
 def parse_count(text: str) -> int:
-    """Parse a whole number above zero; the `type` of a flag. Raises ArgumentTypeError for any other text."""
+    """Parse a whole number above zero; the `type` of a flag. Raises argparse.ArgumentTypeError for any other text."""
     with suppress(ValueError):
         if (value := int(text)) > 0:
             return value
-    raise ArgumentTypeError(f"`{text}` is not a whole number above 0")
+    raise argparse.ArgumentTypeError(f"`{text}` is not a whole number above 0")
 
 
 def check_output(target: str, source: str) -> Path:

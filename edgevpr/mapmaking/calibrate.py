@@ -79,11 +79,11 @@ class QueryResult:
     refused: bool = False
 
 
-def query_map(search: MapSearch, pictures: Iterable[tuple[int, LevelledImage]], seed: int = 0) -> Iterator[QueryResult]:
+def query_map(search: MapSearch, pictures: Iterable[tuple[int, LevelledImage]]) -> Iterator[QueryResult]:
     """Query the map with altered pictures of its own places, in all three ways, and yield the results. `pictures` are
     pairs of a place id and its picture as encoded for the map. Places that are not in the index are skipped. The rule
     of the `search` is changed to reject hardly any match for low confidence."""
-    rng = np.random.default_rng((_SEED, seed))
+    rng = np.random.default_rng((_SEED, 0))
     assert search.rule.confidence_rule is not None  # set for techniques with a confidence model
     low_precision_rule = replace(search.rule.confidence_rule, precision=_LOW_PRECISION)
     search.rule = replace(search.rule, confidence_rule=low_precision_rule)

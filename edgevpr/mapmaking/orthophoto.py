@@ -10,14 +10,13 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Image
 from edgevpr.core.errors import ImageError, SourceError
-from edgevpr.core.geodesy import wrap_deg
+from edgevpr.core.geodesy import D, wrap_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resize
 
@@ -45,8 +44,6 @@ _WEB_MERCATOR = CRS.from_epsg(3857)
 _WEB_MERCATOR_M = 2 * math.pi * 6_378_137.0  # its width
 _EDGE_POINTS = 25  # per edge, because a straight edge of the file is a curve in another coordinate system
 _MAX_HALVINGS = 8  # of the resolution; eight reduce a tile of 256 pixels to one
-
-Coordinate = TypeVar("Coordinate", float, Doubles)
 
 
 class Orthophoto:
@@ -210,7 +207,7 @@ class Orthophoto:
         self._data.close()
 
 
-def _apply_affine(affine: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+def _apply_affine(affine: rasterio.Affine, x: D, y: D) -> tuple[D, D]:
     """Apply an affine transform to x and y (scalars or arrays). Affine's own operator differs between its releases."""
     return affine.a * x + affine.b * y + affine.c, affine.d * x + affine.e * y + affine.f
 

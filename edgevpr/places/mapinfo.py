@@ -69,14 +69,16 @@ class MapInfo:
 def describe_map(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with translate_errors(place_map.path):
-        summary = place_map.db.execute(_SUMMARY).fetchone()
-    places, with_position, of_low_quality, with_pose, var_m2, first, last = summary
+        row = place_map.db.execute(_SUMMARY).fetchone()
+        places, with_position, of_low_quality, with_pose, var_m2, first, last = row
+        extent = place_map.db.execute(_EXTENT).fetchone() if with_position else None
+    has_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return MapInfo(
         path=str(place_map.path),
         spec=place_map.spec,
         places=places,
         with_position=with_position,
-        extent=_read_extent(place_map) if with_position else None,
+        extent=extent if has_extent else None,
         first_time=first,
         last_time=last,
         of_low_quality=int(of_low_quality),
@@ -87,14 +89,6 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
         one_way_deg=_find_one_way_deg(place_map) if place_map.spec.parameters.get("camera") == "nadir" else None,
         file_bytes=place_map.path.stat().st_size,
     )
-
-
-def _read_extent(place_map: PlaceMap) -> Extent | None:
-    """Return the bounding box that the file declares for its places; None if missing or invalid. Raises MapError."""
-    with translate_errors(place_map.path):
-        extent = place_map.db.execute(_EXTENT).fetchone()
-    is_valid = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
-    return extent if is_valid else None
 
 
 def _find_one_way_deg(place_map: PlaceMap) -> float | None:

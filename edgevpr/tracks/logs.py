@@ -96,7 +96,7 @@ def _read_messages(open_log: Callable[[str], Any], path: Path, types: list[str])
 
 def read_px4(path: Path) -> Record:
     """Read a PX4 log: estimated position, height above the starting point, attitude, and `camera_capture`."""
-    require_package("pyulog", "pyulog", "A PX4 log")
+    require_package("pyulog", "A PX4 log")
     from pyulog import ULog
 
     try:
@@ -146,7 +146,7 @@ def _interpolate_attitudes(attitude: dict[str, Array], times_us: Array) -> list[
 
 def read_gpx(path: Path) -> Record:
     """Read all track points of a GPX file that have a time; a time without a zone is UTC."""
-    require_package("gpxpy", "gpxpy", "A GPX file")
+    require_package("gpxpy", "A GPX file")
     import gpxpy
     from gpxpy.gpx import GPXException
 

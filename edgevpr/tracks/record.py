@@ -85,7 +85,7 @@ def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | Non
     return Track(path, tuple(tags), tuple(tags.values())) if tags else None
 
 
-def require_package(module: str, package: str, what: str) -> None:
-    """Raise UsageError if the module that reads `what` is not installed. `package`: its name on PyPI."""
-    if find_spec(module) is None:
+def require_package(package: str, what: str) -> None:
+    """Raise UsageError if the package that reads `what` is not installed."""
+    if find_spec(package) is None:
         raise UsageError(f"{what} needs {package}, which is not installed: run `pip install {package}`.")

@@ -50,8 +50,6 @@ from edgevpr.runtime.recognise.salience_gate import SalienceGate
 from edgevpr.techniques import create, format_name
 from edgevpr.techniques.card import describe_weights
 
-_NO_TAG = GeoTag()
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchOptions:
@@ -126,14 +124,14 @@ def answer_queries(
         scored = {query.path.name: query for query in dataset.queries}
         paths = [query.path for query in dataset.queries]
         # Run one query without measuring it, because the first one is slowed down by lazy imports and a cold disk.
-        _recognise(make_recogniser(1, False), paths[0], _NO_TAG)
+        _recognise(make_recogniser(1, False), paths[0], GeoTag())
         if gate:
             gate.reset()
         if sequence > 1 or tracks_flight:  # a sequence includes the queries that are not scored
             paths = list_images(paths[0].parent)
         recogniser, answers = make_recogniser(sequence, tracks_flight), []
         for path in progress(paths, len(paths), f"{spec.name}: queries"):
-            event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
+            event = _recognise(recogniser, path, tags.get(path, GeoTag()))
             if query := scored.get(path.name):
                 answers.append(_judge(event, query, dataset.references, index))
     return answers, not_done

@@ -6,7 +6,7 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
@@ -43,15 +43,14 @@ class Trial:
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
-def list_trials(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Trial, ...]:
-    """Return the trials to run: one for each form of each technique in `names`, or one for a technique that has no
-    forms or whose settings contain one. `settings`: by technique name. Raises UsageError for an unknown name,
-    ModelError for an incomplete model card."""
+def list_trials(settings: Mapping[str, Mapping[str, Any]], forms: Sequence[str] = FORMS) -> tuple[Trial, ...]:
+    """Return the trials to run: one for each of the `forms` of each technique in `settings`, or one for a technique
+    that has no forms or whose settings contain one. `settings`: by technique name. Raises UsageError for an unknown
+    name, ModelError for an incomplete model card."""
     trials = []
-    for name in names:
-        fixed = dict((settings or {}).get(name, {}))
+    for name, fixed in settings.items():
         has_one_form = "form" in fixed or "form" not in techniques.read_parameters(name)
-        for variant in (fixed,) if has_one_form else ({**fixed, "form": form} for form in FORMS):
+        for variant in (dict(fixed),) if has_one_form else ({**fixed, "form": form} for form in forms):
             trials.append(Trial(label=techniques.format_name(name, variant.get("form")), name=name, settings=variant))
     return tuple(trials)
 
