@@ -11,7 +11,7 @@ from pictures import draw_texture
 
 from edgevpr.cli.main import program
 from edgevpr.frames import source
-from edgevpr.frames.shot import Shot
+from edgevpr.frames.shot import Capture, Shot
 from edgevpr.runtime.flight.flight import Flight
 
 _STEP = sys.argv[1]
@@ -28,7 +28,7 @@ def hang() -> None:
     libc.pthread_mutex_lock(mutex)
 
 
-class HangingCapture:
+class HangingCapture(Capture):
     """Gives ten pictures a second, and hangs in its step; or is lost, if that is `release`."""
 
     def __init__(self) -> None:
@@ -48,9 +48,6 @@ class HangingCapture:
         if self._number > _PICTURES and _STEP == "pixels":
             hang()
         return picture
-
-    def cancel(self) -> None:
-        pass
 
     def release(self) -> None:
         hang()

@@ -1,10 +1,8 @@
 """Files: the shipped folders and the user's own; safe reading of regular files of limited size; atomic writing."""
 
 import errno
-import hashlib
 import os
 import stat
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -62,15 +60,6 @@ def read_file(path: str | Path, max_bytes: int) -> bytes:
         # Never request more than the file has: Python allocates the requested size first.
         size = os.fstat(handle.fileno()).st_size or min(max_bytes, _KERNEL_FILE_BYTES)
         return handle.read(size) or b""  # `read` returns None for a kernel file that has no data yet
-
-
-def compute_sha256(path: str | Path, max_bytes: int = sys.maxsize) -> str:
-    """Compute the SHA-256 of a regular file, 64 hexadecimal digits; raises OSError as `open_file` does."""
-    digest = hashlib.sha256()
-    with open_file(path, max_bytes) as handle:
-        while block := handle.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def require_folder(path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Image
 from edgevpr.frames.age import UnstampedTime
 from edgevpr.frames.depth import DepthRange, make_counts_thumbnail, to_8_bits
-from edgevpr.frames.shot import OpeningError, Shot, make_thumbnail
+from edgevpr.frames.shot import Capture, OpeningError, Shot, make_thumbnail
 
 _ERRNO_CAUSES = {
     errno.ENOENT: "not connected",
@@ -55,8 +55,9 @@ def _find_cause(path: str) -> str:
     return "in use by another program, or in a format that OpenCV cannot read"
 
 
-class DeviceCapture:
-    """A V4L2 camera opened with OpenCV: a `Capture`. OpenCV does not report damaged images, so none is rejected."""
+class DeviceCapture(Capture):
+    """A V4L2 camera opened with OpenCV, which does not report damaged images, so none is rejected. Its wait for an
+    image cannot be interrupted, but times out (see `frames.images`)."""
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
@@ -83,9 +84,6 @@ class DeviceCapture:
             return make_counts_thumbnail(counts), lambda: to_8_bits(counts, limits)
         image: Image = np.asarray(picture, np.uint8)
         return make_thumbnail(image if image.ndim == 2 else image[:, :, 1]), lambda: image
-
-    def cancel(self) -> None:
-        """Do nothing: OpenCV's wait for an image cannot be interrupted, but times out (see `frames.images`)."""
 
     def release(self) -> None:
         self._capture.release()

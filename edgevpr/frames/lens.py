@@ -56,16 +56,13 @@ class CalibratedLens:
     is_fisheye: bool
     size_px: tuple[int, int]
 
-    def matrix(self) -> Doubles:
-        """Return OpenCV's camera matrix (3, 3)."""
-        (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
-        return np.array([[focal_x, 0, column], [0, focal_y, row], [0, 0, 1]])
-
     def project(self, rays: Doubles) -> Doubles:
         """Project rays (N, 2) to pixels (N, 2)."""
         points = np.ascontiguousarray(np.column_stack([rays, np.ones(len(rays))]))[:, None]
+        (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
+        matrix = np.array([[focal_x, 0, column], [0, focal_y, row], [0, 0, 1]])
         project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
-        pixels, _ = project(points, np.zeros(3), np.zeros(3), self.matrix(), np.array(self.coefficients))
+        pixels, _ = project(points, np.zeros(3), np.zeros(3), matrix, np.array(self.coefficients))
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     def resize_to(self, size_px: tuple[int, int]) -> "CalibratedLens":

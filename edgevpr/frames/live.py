@@ -217,7 +217,7 @@ class LiveSource(Source):
             now_s = self._clock()
             refusal = shot if isinstance(shot, Refusal) else self._store_shot(shot, now_s)
             if refusal is None:
-                self.facts = self.facts or getattr(opening.capture, "facts", None)
+                self.facts = self.facts or (opening.capture.facts if opening.capture else None)
             else:
                 self.refused[refusal.value] += 1
                 self._liveness.record_refusal(refusal, now_s)

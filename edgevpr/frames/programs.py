@@ -21,7 +21,7 @@ from edgevpr.core.errors import SourceError
 from edgevpr.core.text import sanitize
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
-from edgevpr.frames.shot import OpeningError, Refusal, Shot
+from edgevpr.frames.shot import Capture, OpeningError, Refusal, Shot
 from edgevpr.frames.streams import StreamCapture, open_raw
 
 _RPICAM = "rpicam-vid"
@@ -97,8 +97,8 @@ def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     raise OpeningError(f"{name} exited with code {exit_code}{errors.explain_exit()}")
 
 
-class ProgramCapture:
-    """The pictures that `process` reads from a camera and sends: a `Capture`."""
+class ProgramCapture(Capture):
+    """The pictures that `process` reads from a camera and sends."""
 
     def __init__(self, stream: StreamCapture, process: "subprocess.Popen[bytes]") -> None:
         self._stream, self._process = stream, process

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,17 +90,24 @@ class StreamFacts:
         return f"{self.codec}, {self.bits} bits per channel, {shape}{rate}"
 
 
-class Capture(Protocol):
-    """An open camera or stream. One thread uses it from opening to release; other threads may only call `cancel`."""
+class Capture:
+    """Base class of open cameras and streams. One thread uses it from opening to release; other threads may only call
+    `cancel`."""
+
+    @property
+    def facts(self) -> StreamFacts | None:
+        """A stream's description of its pictures; None if it has none."""
+        return None
 
     def read(self) -> Shot | Refusal | None:
         """Wait for the next picture and return it, or the reason for its rejection; None if the source is lost."""
+        raise NotImplementedError
 
     def cancel(self) -> None:
         """Make a waiting `read` return soon, if possible. Returns immediately."""
 
     def release(self) -> None:
-        """Close the camera or the connection."""
+        """Close the camera or the connection, if it is still open."""
 
 
 def make_thumbnail(plane: Plane) -> Plane:

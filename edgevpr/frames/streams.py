@@ -11,7 +11,7 @@ from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S, CaptureTime, StampedTime, UnstampedTime
 from edgevpr.frames.decoding import TimedPacket, TransportError, VideoDecoder, open_decoder
 from edgevpr.frames.rtp import describe_rtp
-from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
+from edgevpr.frames.shot import Capture, OpeningError, Refusal, Shot, StreamFacts
 from edgevpr.frames.webpictures import ResponseFile, SnapshotCapture, try_request
 
 OPEN_TIMEOUT_S = 5.0
@@ -80,8 +80,8 @@ def _open_stream(uri: str) -> VideoDecoder:
         return open_decoder(uri, _UDP_OPTIONS, udp_timeouts_s)
 
 
-class StreamCapture:
-    """The images of an open stream: a `Capture`. `decoder` decodes it. `clock` is the monotonic clock in seconds, and
+class StreamCapture(Capture):
+    """The images of an open stream. `decoder` decodes it. `clock` is the monotonic clock in seconds, and
     `opened_s` its time just before the opening. `delay_sd_s`: see `Shot`."""
 
     def __init__(

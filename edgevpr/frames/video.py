@@ -47,13 +47,7 @@ class VideoSource(RecordingSource):
     and once if the end of the file is missing."""
 
     def __init__(
-        self,
-        path: Path,
-        step_s: float,
-        clock: Callable[[], float],
-        only: Collection[str] | None = None,
-        *,
-        track: Track | None = None,
+        self, path: Path, step_s: float, clock: Callable[[], float], only: Collection[str] | None, track: Track | None
     ):
         super().__init__(only)
         self._path, self._step_s, self._clock, self._track = path, step_s, clock, track

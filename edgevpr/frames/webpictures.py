@@ -15,7 +15,7 @@ from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.images import decode_image, encode_jpeg, is_whole_jpeg
-from edgevpr.frames.shot import OpeningError, Refusal, Shot, make_thumbnail
+from edgevpr.frames.shot import Capture, OpeningError, Refusal, Shot, make_thumbnail
 
 _MAX_BYTES = 64_000_000  # of one image
 _MAX_PART_S = 15.0  # for one image of a multipart stream: a slow sender must not block a thread for ever
@@ -58,10 +58,10 @@ def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
     return None
 
 
-class SnapshotCapture:
-    """A `Capture` that requests the image at `uri` every `period_s` seconds. Its capture time is that of the request,
-    when most cameras take it. A camera that returned the same file twice keeps an image ready, which may be as old as
-    the previous request."""
+class SnapshotCapture(Capture):
+    """Requests the image at `uri` every `period_s` seconds; each request takes a few seconds at most. Its capture time
+    is that of the request, when most cameras take it. A camera that returned the same file twice keeps an image ready,
+    which may be as old as the previous request."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
@@ -89,12 +89,6 @@ class SnapshotCapture:
         sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_buffered else arrival_s - self._request_s)
         times = {"t_mono_s": taken_s, "t_sd_s": sd_s, "delay_sd_s": HIDDEN_DELAY_SD_S}
         return Shot(thumbnail=make_thumbnail(plane), convert=lambda: image, **times)
-
-    def cancel(self) -> None:
-        """Do nothing: a request takes a few seconds at most."""
-
-    def release(self) -> None:
-        """Do nothing: no connection stays open between requests."""
 
 
 class ResponseFile:

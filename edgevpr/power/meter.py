@@ -80,19 +80,11 @@ class QueryMeter:
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""
         steps, efficiency = self.steps(), self._regulator_efficiency
-        return compute_query_cost(
-            steps.encoding, steps.match, self.board, self._pack, efficiency, rss_mb=self._memory_mb()
-        )
+        return compute_query_cost(steps.encoding, steps.match, self.board, self._pack, efficiency, self._memory_mb())
 
 
 def compute_query_cost(
-    encode: StageCost,
-    match: StageCost,
-    board: Board,
-    pack: Pack,
-    regulator_efficiency: float,
-    *,
-    rss_mb: float,
+    encode: StageCost, match: StageCost, board: Board, pack: Pack, regulator_efficiency: float, rss_mb: float
 ) -> QueryCost:
     """Compute the cost of one query by equations 5.1-5.6, with the energies of both stages summed. Charges are drawn
     from the pack: `used_mah` for (a + s U) t, and `marginal_mah` for s U t, the addition to an idle board."""

@@ -13,6 +13,7 @@ from typing import Any
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import suggest
+from edgevpr.techniques.card import list_cards, load_card
 
 # The class or function that creates each built-in technique.
 _FACTORIES = {
@@ -35,7 +36,6 @@ _TYPE_NAMES = {int: "an integer", float: "a number", str: "text"}
 def list_techniques() -> tuple[str, ...]:
     """Return the names of all techniques: the built-in ones, then the networks whose cards have a descriptor.
     Unreadable cards are skipped. A card with the name of a built-in technique only supplies its weights."""
-    from edgevpr.techniques.card import list_cards, load_card
 
     def is_technique(card: str) -> bool:
         try:
@@ -48,8 +48,6 @@ def list_techniques() -> tuple[str, ...]:
 
 def is_known(name: str) -> bool:
     """Return True if `name` is a technique or the card of a network."""
-    from edgevpr.techniques.card import list_cards
-
     return name in _FACTORIES or name in list_cards()
 
 
@@ -92,8 +90,6 @@ def _find_factory(name: str) -> Callable[..., Any]:
         return factory
     if not is_known(name):
         raise UsageError(f"There is no technique `{name}`: use one of {', '.join(list_techniques())}.")
-    from edgevpr.techniques.card import load_card
-
     card = load_card(name)
     if not card.is_technique:
         raise UsageError(f"The network `{name}` has no descriptor output: use it as the `model` of a technique.")

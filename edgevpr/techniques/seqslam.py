@@ -36,7 +36,7 @@ class SeqSlam:
                 f"seqslam cannot use width={width}, height={height}, patch={patch}: width and height must be "
                 "multiples of patch (at least 2 pixels), at most 512."
             )
-        self._width, self._height, self._patch = width, height, patch
+        self._size, self._patch, self._grid = (width, height), patch, (height // patch, width // patch)
         self.spec = TechniqueSpec(
             name="seqslam",
             parameters={"width": width, "height": height, "patch": patch},
@@ -48,20 +48,18 @@ class SeqSlam:
         """Encode uint8 (H, W[, 3]) to coarse uint8 (height * width,): 128 + 28 times the deviation of a pixel from its
         patch's mean, in standard deviations of the patch. Pixels where `mask` is False count as their patch's mean. The
         quality is the fraction of patches that vary."""
-        size = (self._width, self._height)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         seen = np.ones(image.shape[:2], np.uint8) if mask is None else mask.astype(np.uint8)
-        pixels = self._cut_patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
-        allowed = self._cut_patches(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST))
+        pixels = self._cut_patches(cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA))
+        allowed = self._cut_patches(cv2.resize(seen, self._size, interpolation=cv2.INTER_NEAREST))
         z, spread = normalise_patches(pixels, allowed)
         levels = np.clip(np.rint(_LEVELS_PER_SD * z) + _MEAN_LEVEL, 0, 255).astype(np.uint8)
-        rows, columns = self._height // self._patch, self._width // self._patch
-        coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
+        coarse = levels.reshape(*self._grid, self._patch, self._patch).swapaxes(1, 2).ravel()
         return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _MIN_PATCH_SD_LEVELS)))
 
     def _cut_patches(self, picture: Array) -> Singles:
         """Cut an image into patches: (height, width) to float32 (patches, patch * patch)."""
-        rows, columns = self._height // self._patch, self._width // self._patch
+        rows, columns = self._grid
         blocks = picture.astype(np.float32).reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
         return blocks.reshape(rows * columns, self._patch * self._patch)
 

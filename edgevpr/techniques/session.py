@@ -1,6 +1,7 @@
 """Runs a network on an image and returns its outputs. Only this module uses onnxruntime in flight, and imports it for
 the first network. A model file is not trusted: it is run once before the flight, and every result is checked."""
 
+import hashlib
 import os
 from functools import cache
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image, Mask, Singles
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.core.files import compute_sha256, read_file
+from edgevpr.core.files import open_file, read_file
 from edgevpr.techniques.card import Card, InputRule, load_card
 
 _OUTPUT_SHAPES = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
@@ -79,12 +80,16 @@ def open_session(card: Card, threads: int = 1) -> Any:
 
 def hash_model_file(path: Path) -> str:
     """Compute the SHA-256 of a model file, 64 hexadecimal digits. Raises ModelError if it cannot be read."""
+    digest = hashlib.sha256()
     try:
-        return compute_sha256(path, MAX_FILE_BYTES)
+        with open_file(path, MAX_FILE_BYTES) as handle:
+            while block := handle.read(1 << 20):
+                digest.update(block)
     except OSError as error:
         raise ModelError(
             f"{path} cannot be read ({error.strerror}): put the weights there, or remove the card."
         ) from error
+    return digest.hexdigest()
 
 
 @cache

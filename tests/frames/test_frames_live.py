@@ -20,7 +20,7 @@ from edgevpr.frames import live as live_module
 from edgevpr.frames import liveness
 from edgevpr.frames import source as source_module
 from edgevpr.frames.live import LiveSource
-from edgevpr.frames.shot import Condition, OpeningError, Refusal, Shot
+from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, Shot
 from edgevpr.frames.source import open_source
 
 
@@ -133,7 +133,7 @@ def make_shot(number, t_mono_s=None):
     return Shot(t_mono_s=t_mono_s, thumbnail=picture, convert=lambda: picture)
 
 
-class Camera:
+class Camera(Capture):
     """A `Capture` that gives what `shots` yields, and then nothing. It hangs in the step `hangs` (pixels: for each
     picture), until `go` is set."""
 

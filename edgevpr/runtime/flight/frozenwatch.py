@@ -83,11 +83,13 @@ class Optics:
         shift = self.focal * _subtract_error(math.hypot(across_deg, pitch_deg))
         return math.hypot(min(1.0, shift), _RMS_RADIUS * _subtract_error(about_deg))
 
-    def compute_travel_motion(self, moved_m: float, height_m: float | None) -> float:
-        """Return the least motion of an image if the aircraft has moved by `moved_m`; 0 if the camera does not look
+    def compute_travel_motion(self, earlier: "TimedImage", now: "TimedImage", speed_error_m_s: float) -> float:
+        """Return the least motion of an image due to the way flown since an earlier one; 0 if the camera does not look
         down, or the height is unknown."""
+        height_m = now.vehicle.height_m if now.vehicle else None
         if not self.looks_down or height_m is None or not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
             return 0.0
+        moved_m = now.compute_displacement_m(earlier) - speed_error_m_s * (now.t_s - earlier.t_s)
         return max(0.0, moved_m) * self.focal / (_MAX_HEIGHT_RATIO * height_m)
 
 
@@ -186,7 +188,8 @@ class FrozenWatch:
     def _handle_same(self, first: TimedImage, now: TimedImage) -> None:
         """Process an image that equals the first one of its run of equal images."""
         self._new_in_a_row = 0
-        self._travel_motion = max(self._travel_motion, self._compute_travel_motion(first, now, _SPEED_ERROR_M_S))
+        travel_motion = self._optics.compute_travel_motion(first, now, _SPEED_ERROR_M_S)
+        self._travel_motion = max(self._travel_motion, travel_motion)
         rotation_motion = self._optics.compute_rotation_motion(self._rotation_start, now.vehicle)
         if rotation_motion >= MIN_MOTION:
             self._rotations.append((now.t_s, min(rotation_motion, _MAX_SINGLE_MOTION)))
@@ -217,13 +220,9 @@ class FrozenWatch:
         if is_flying and self._optics.looks_down and not now.has_returned_to(earlier):
             self._repeats_in_a_row += 1
         rotation_motion = self._optics.compute_rotation_motion(earlier.vehicle, now.vehicle)
-        motion = max(rotation_motion, self._compute_travel_motion(earlier, now, _PATH_DRIFT_M_S))
+        motion = max(rotation_motion, self._optics.compute_travel_motion(earlier, now, _PATH_DRIFT_M_S))
         if motion >= MIN_MOTION:
             self._repeats.append((now.t_s, min(motion, _MAX_SINGLE_MOTION)))
-
-    def _compute_travel_motion(self, earlier: TimedImage, now: TimedImage, speed_error_m_s: float) -> float:
-        moved_m = now.compute_displacement_m(earlier) - speed_error_m_s * (now.t_s - earlier.t_s)
-        return self._optics.compute_travel_motion(moved_m, now.vehicle.height_m if now.vehicle else None)
 
     def _is_same(self, earlier: CoarseImage, now: CoarseImage, updates_static: bool = False) -> bool | None:
         """Return True if two images are the same, unmoved; None if their texture cannot show a motion. Blocks that

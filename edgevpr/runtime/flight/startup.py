@@ -51,8 +51,7 @@ def apply_recorded_rate(source: SourceConfig, steps_s: Sequence[float]) -> Sourc
     if not steps_s:
         return source
     median_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
-    median_hz = min(max(median_hz, MIN_RATE_HZ), MAX_RATE_HZ)
-    return replace(source, rate_hz=median_hz)
+    return replace(source, rate_hz=min(max(median_hz, MIN_RATE_HZ), MAX_RATE_HZ))
 
 
 def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:

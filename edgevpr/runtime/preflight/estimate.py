@@ -106,9 +106,7 @@ def compute_counted_costs(trial: Trial, board: Board) -> TechniqueCosts | None:
 
 def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
     costs, match = option.costs, option.costs.match(plan.places)
-    query = compute_query_cost(
-        costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb
-    )
+    query = compute_query_cost(costs.encode, match, board, plan.pack, plan.regulator_efficiency, costs.process_mb)
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, option.reachable_hz) * flight_s, query.marginal_mah)
     # Equation 5.7 omits the idle power between queries, which the pack also supplies.

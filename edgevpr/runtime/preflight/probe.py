@@ -162,7 +162,10 @@ class _Bench:
     ) -> list[StepCosts]:
         """Match each image up to `max_tries` times with `place_map`, whose `index` is in RAM, comparing `candidates`
         places. Returns one `StepCosts` per image: the least cost of each step."""
-        recogniser = self._open_recogniser(place_map, index, candidates)
+        technique, settings = self._technique, MatchSettings(candidates=candidates)
+        rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
+        matcher = Matcher(index, rule, make_sequence_search(self.sequence))
+        recogniser = Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings=settings)
         times_s = (0.1 * number for number in itertools.count())
 
         def match_pictures() -> list[StepCosts]:
@@ -177,13 +180,6 @@ class _Bench:
             StepCosts(**{name: _find_least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
         ]
-
-    def _open_recogniser(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
-        technique = self._technique
-        rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
-        matcher = Matcher(index, rule, make_sequence_search(self.sequence))
-        settings = MatchSettings(candidates=candidates)
-        return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings=settings)
 
 
 def _match_picture(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:
