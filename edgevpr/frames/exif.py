@@ -164,9 +164,8 @@ def _find_values(packet: bytes) -> dict[str, bytes]:
 def _find_angles(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
     """Return yaw, pitch and roll; `name` has {} in place of the axis. None if one is missing or all are zero."""
     with contextlib.suppress(KeyError, ValueError):
-        yaw, pitch, roll = (
-            _require_range(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll")
-        )
+        numbers = (float(values[name.format(axis)]) for axis in ("Yaw", "Pitch", "Roll"))
+        yaw, pitch, roll = (_require_range(number, -360, 360) for number in numbers)
         return (yaw, pitch, roll) if any((yaw, pitch, roll)) else None
     return None
 

@@ -47,10 +47,9 @@ class ThermalWatch:
         self._allowed_khz = 0
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
         # Raspberry Pi driver. Its alarm lasts 2 s, so that a dip between two readings is not missed.
-        volts = (
-            name.parent for name in (root / "sys/class/hwmon").glob("*/name") if machine.read_text(name) == "rpi_volt"
-        )
-        self._alarm = next((folder / "in0_lcrit_alarm" for folder in volts), None)
+        names = (root / "sys/class/hwmon").glob("*/name")
+        alarms = (name.with_name("in0_lcrit_alarm") for name in names if machine.read_text(name) == "rpi_volt")
+        self._alarm = next(alarms, None)
         self._previous_bits: int | None = None
 
     def read(self) -> ThermalState:

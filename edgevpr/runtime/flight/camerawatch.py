@@ -77,8 +77,7 @@ class MirrorWatch:
         self._next_try = self._misses + (1 if is_mirrored else _MISSES_TO_TRY_AGAIN)
         if self._matches == _MIRRORED_TO_REPORT:
             self._tries = _MAX_TRIES
-            note = Reason(ReasonCode.IMAGES_MIRRORED)
-            self._notifier.report("camera", Severity.WARNING, note, topic="mirror")
+            self._notifier.report("camera", Severity.WARNING, Reason(ReasonCode.IMAGES_MIRRORED), topic="mirror")
 
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
         """Return True if the mirrored image matches anywhere in the map, without the state of the flight."""

@@ -90,9 +90,7 @@ class GpsWatch:
         is_far = _is_beyond(error_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
         is_mean_known = self._mean_count >= _MIN_MEAN_MATCHES
         has_moved = is_mean_known and _is_beyond(error_m - self._mean_error_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
-        self._recent_opposing = [
-            other for other in self._recent_opposing if match.t_s - other.t_s <= _RECENT_OPPOSING_S
-        ]
+        self._recent_opposing = [past for past in self._recent_opposing if match.t_s - past.t_s <= _RECENT_OPPOSING_S]
         if not is_far and not has_moved:
             self._opposing.clear()
             self._agreements += 1

@@ -27,9 +27,7 @@ class HeightWatch:
         self.image_height_m: float | None = None
         self.autopilot_height_m: float | None = None
         self._notifier, self._autopilot = notifier, autopilot
-        self._heights_m: deque[tuple[float, float]] = deque(
-            maxlen=MATCHES_IN_A_ROW
-        )  # from pictures, from the autopilot
+        self._heights_m: deque[tuple[float, float]] = deque(maxlen=MATCHES_IN_A_ROW)  # of images, of the autopilot
         self._last_s: float | None = None
 
     @property

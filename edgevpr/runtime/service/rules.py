@@ -76,9 +76,8 @@ def _check_single_fixes(choice: ChannelChoice, reading: AutopilotReading, sends_
         changes.append("GPS_AUTO_SWITCH=1")
     if not sends_fixes:
         return report_ok("channel", FindingCode.CHANGES_AFTER_DRY_RUN, changes=" and ".join(changes))
-    replaced_type = parameters.get(receiver_name) or None
-    figures = {"receiver_type": replaced_type, "parameter": None, "value": None}
-    return report_fault("channel", FindingCode.NOT_CARRIED, *changes, vehicle=reading.vehicle, **figures)
+    replaced = parameters.get(receiver_name) or None
+    return report_fault("channel", FindingCode.NOT_CARRIED, *changes, vehicle=reading.vehicle, receiver_type=replaced)
 
 
 def _report_dry_run(choice: ChannelChoice, reading: AutopilotReading) -> Finding:
@@ -104,7 +103,7 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
         yield _report_channel(choice)
     else:
         vision_control = reading.parameters.get(VISION_CONTROL) or None
-        figures = {"receiver_type": None, "parameter": VISION_CONTROL, "value": vision_control}
+        figures = {"parameter": VISION_CONTROL, "value": vision_control}
         change = f"{VISION_CONTROL}={POSITION_BIT}"
         yield report_fault("channel", FindingCode.NOT_CARRIED, change, vehicle=reading.vehicle, **figures)
     yield from _check_parameters(PX4_TABLE, choice, reading)
