@@ -163,10 +163,8 @@ class StampedTime:
         if arrival_s[-1] - self._steady_check_s > _STEADY_SPAN_S:
             self._steady_check_s = arrival_s[-1]
             first = int(np.searchsorted(arrival_s, arrival_s[-1] - _STEADY_SPAN_S))
-            if (
-                np.ptp(order_delay_s[first:]) < _MAX_STEADY_RANGE_S
-                and bound_size_dependence(window[first:])[0] < _MAX_CLOCK_DEPENDENCE
-            ):
+            is_steady = np.ptp(order_delay_s[first:]) < _MAX_STEADY_RANGE_S
+            if is_steady and bound_size_dependence(window[first:])[0] < _MAX_CLOCK_DEPENDENCE:
                 self._min_delay_s = float(np.min((arrival_s - self.rate * stamp_s)[first:]))
                 self._min_order_delay_s = float(order_delay_s[first:].min())
                 self._max_known_age_s = math.inf

@@ -90,11 +90,9 @@ def _read_position(tags: Tags) -> Position | None:
 
 
 def _read_degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
-    degrees, minutes, seconds = map(float, tags[name].values)
     # 60 is allowed: it may be a rounded 59.99999.
-    value = (
-        _require_range(degrees, 0, limit) + _require_range(minutes, 0, 60) / 60 + _require_range(seconds, 0, 60) / 3600
-    )
+    parts = zip(map(float, tags[name].values), (limit, 60, 60), (1, 60, 3600), strict=True)
+    value = sum(_require_range(part, 0, largest) / divisor for part, largest, divisor in parts)
     return signs[tags[f"{name}Ref"].values.strip()] * _require_range(value, 0, limit)
 
 
@@ -111,14 +109,9 @@ def _read_heading_deg(tags: Tags) -> float | None:
 
 
 def _read_gps_time_s(tags: Tags) -> float:
-    hours, minutes, seconds = map(float, tags["GPS GPSTimeStamp"].values)
     day_s = _parse_time_s(f"{tags['GPS GPSDate'].values} 00:00:00")
-    return (
-        day_s
-        + _require_range(hours, 0, 24) * 3600
-        + _require_range(minutes, 0, 60) * 60
-        + _require_range(seconds, 0, 61)
-    )
+    parts = zip(map(float, tags["GPS GPSTimeStamp"].values), (24, 60, 61), (3600, 60, 1), strict=True)
+    return sum((_require_range(part, 0, largest) * unit_s for part, largest, unit_s in parts), start=day_s)
 
 
 def _read_camera_time_s(tags: Tags) -> float:

@@ -139,10 +139,8 @@ class StreamCapture(Capture):
 
     def _make_shot(self, picture: VideoFrame, unstamped: CaptureTime, arrival_s: float) -> Shot | Refusal:
         taken: CaptureTime | None = unstamped
-        if self._stamped:
-            taken = (
-                None if picture.pts is None else self._stamped.estimate(picture.pts * self._decoder.unit_s, arrival_s)
-            )
+        if stamped := self._stamped:
+            taken = None if picture.pts is None else stamped.estimate(picture.pts * self._decoder.unit_s, arrival_s)
         if taken is None:
             return Refusal.LATE
         thumbnail, convert = self._decoder.make_thumbnail(picture), self._decoder.prepare_conversion(picture)

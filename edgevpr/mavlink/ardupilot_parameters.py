@@ -108,13 +108,11 @@ def _check_primary(parameters: Parameters, choice: ChannelChoice) -> Iterator[st
 def _check_switch(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """Yield the change that lets ArduPilot switch to our receiver, without blending it (AP_GPS.cpp, update_primary)."""
     switch = parameters.get("GPS_AUTO_SWITCH", _SWITCH_BEST)
-    if switch in (_SWITCH_BEST, _SWITCH_PRIMARY_IF_3D) or (
-        switch == _SWITCH_PRIMARY and _is_primary(parameters, choice)
-    ):
-        return
-    if switch != _SWITCH_BLEND or (
-        _has_other_receiver(parameters, choice) and not any(_check_blend(parameters, choice))
-    ):
+    is_right = switch in (_SWITCH_BEST, _SWITCH_PRIMARY_IF_3D)
+    is_right |= switch == _SWITCH_PRIMARY and _is_primary(parameters, choice)
+    if switch == _SWITCH_BLEND:  # a dangerous blend has its own rule
+        is_right = not _has_other_receiver(parameters, choice) or any(_check_blend(parameters, choice))
+    if not is_right:
         yield f"GPS_AUTO_SWITCH={_SWITCH_BEST}"
 
 

@@ -61,7 +61,7 @@ class Px4Fusion:
         `is_trusted`: False while matches prove that receiver wrong."""
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
         self._reports_fusion |= is_fusing
-        silent_s = now_s - self._sent_s
+        silent_s, timeout_s = now_s - self._sent_s, _VISION_TIMEOUT_S if self._is_vision else _SENSOR_TIMEOUT_S
         if silent_s < _SENDING_TIMEOUT_S:
             # A test ratio above 1 is outside the filter's gate.
             flag = _FUSES_ANY if self._is_vision else _FUSES_ABSOLUTE
@@ -76,9 +76,7 @@ class Px4Fusion:
         if receiver is None:
             self._unused_since_s = None
             self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
-        elif silent_s > (_VISION_TIMEOUT_S if self._is_vision else _SENSOR_TIMEOUT_S) or (
-            self._is_vision and is_fusing
-        ):
+        elif silent_s > timeout_s or (self._is_vision and is_fusing):
             self._infer_gps_use(is_fusing, now_s)
         elif not self.uses_gps or silent_s < _SENDING_TIMEOUT_S:
             is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S

@@ -12,6 +12,8 @@ from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import VehicleKind, classify_vehicle
+from edgevpr.mavlink.channelselector import MAX_PARALLEL_REQUESTS
+from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S
 from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.parameters import ALTERNATIVES
 from edgevpr.mavlink.ports import open_port
@@ -19,10 +21,8 @@ from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_value
 
 HEARTBEAT_INTERVAL_S = 1.0
-HEARTBEAT_TIMEOUT_S = 5.0  # autopilots send one per second
 MAX_TRIES = 3
 ANSWER_TIMEOUT_S = 1.0
-MAX_PARALLEL_REQUESTS = 10  # parameters requested at once; ArduPilot drops requests beyond 20
 LISTEN_S = 4.0  # time to detect other autopilots, corrupt bytes and signatures
 
 _STREAM_TIMEOUT_S = 1.2

@@ -68,10 +68,8 @@ def pad_to_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
     top, left = (side - height) // 2, (side - width) // 2
     border = top, side - height - top, left, side - width - left
     allowed = np.ones((height, width), bool) if mask is None else mask
-    return (
-        cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE),
-        cv2.copyMakeBorder(allowed.astype(np.uint8), *border, cv2.BORDER_CONSTANT, value=0).astype(bool),
-    )
+    square = cv2.copyMakeBorder(image, *border, cv2.BORDER_REPLICATE)
+    return square, cv2.copyMakeBorder(allowed.astype(np.uint8), *border, cv2.BORDER_CONSTANT, value=0).astype(bool)
 
 
 def compute_histograms(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:

@@ -59,12 +59,8 @@ def _compute_residuals(homography: Doubles, query: Array, place: Array) -> tuple
     """Return whether each region agrees with a homography, bool (n,), and its residual, complex (n,)."""
     x, y = query.real, query.imag
     scale = 1 + homography[6] * x + homography[7] * y
-    expected = (
-        homography[0] * x
-        + homography[1] * y
-        + homography[2]
-        + 1j * (homography[3] * x + homography[4] * y + homography[5])
-    ) / np.maximum(scale, _MIN_SCALE)
-    errors = place - expected
+    right = homography[0] * x + homography[1] * y + homography[2]
+    down = homography[3] * x + homography[4] * y + homography[5]
+    errors = place - (right + 1j * down) / np.maximum(scale, _MIN_SCALE)
     agrees: Bools = (np.maximum(np.abs(errors.real), np.abs(errors.imag)) <= _MAX_RESIDUAL_CELLS) & (scale > _MIN_SCALE)
     return agrees, errors

@@ -8,7 +8,8 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import show_progress
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.requestlink import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
+from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S
+from edgevpr.mavlink.requestlink import AutopilotReading, RequestLink, read_autopilot
 from edgevpr.mavlink.signing import REFUSAL_MEANINGS, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
