@@ -208,11 +208,8 @@ class AutopilotOutput:
             self._link.set_health(health)
             self._request_source_set()
             self._report_output()
-            self._link.send(
-                messages.make_computer_status(
-                    self._clock.mono_s(), load.core_usage, load.ram_used_bytes, load.ram_total_bytes, temperature_c
-                )
-            )
+            now_s, ram_bytes = self._clock.mono_s(), (load.ram_used_bytes, load.ram_total_bytes)
+            self._link.send(messages.make_computer_status(now_s, load.core_usage, *ram_bytes, temperature_c))
 
     def _request_source_set(self) -> None:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
