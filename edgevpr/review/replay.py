@@ -87,7 +87,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             place_map=place_map,
             log=replace(config.log, path=replay_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
-            machine=tape_machine(Machine(measure_heat=ThermalWatch().read), playback),
+            machine=tape_machine(Machine(measure_heat=ThermalWatch(hot_c=board.thermal_limit_c).read), playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_read_frame, folder)),
             turns=TapedTurns(Clock().mono_s, playback),
             drive=partial(ReplayedDriver, playback),

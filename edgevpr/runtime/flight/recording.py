@@ -65,9 +65,6 @@ class Recording(Tape, AbstractContextManager["Recording"]):
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def read(self, kind: str, measure: Callable[[], T]) -> T:
         """Return the result of `measure`, and record it on the tape under `kind`."""
         value = measure()
@@ -88,7 +85,7 @@ class Recording(Tape, AbstractContextManager["Recording"]):
             self._queue.append((self._frames, jpeg))
         return self._frames
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Write the queue and close the tape. Gives up after 1.5 seconds, with a warning."""
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
