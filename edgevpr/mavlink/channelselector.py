@@ -29,6 +29,7 @@ TOPIC = "parameters"
 
 TABLES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT_TABLE, mavlink.MAV_AUTOPILOT_PX4: PX4_TABLE}
 _DEFAULT_CHOICE = ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_ANY))
+_EMPTY_TABLE = ParameterTable("unknown firmware", (), (), lambda _kind, _parameters: _DEFAULT_CHOICE)
 
 log = logging.getLogger(__name__)
 
@@ -77,12 +78,12 @@ class ChannelSelector:
                     self._decide()
             case "AUTOPILOT_VERSION":
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
-            case "PARAM_VALUE" if message.param_id in self._list_all_names():
+            case "PARAM_VALUE" if message.param_id in self._table.all_names:
                 value = read_parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
                     self._handle_value(message.param_id, value)
             case "PARAM_ERROR" if message.error == mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST:
-                if message.param_id in self._list_all_names() and message.param_id not in self._values:
+                if message.param_id in self._table.all_names and message.param_id not in self._values:
                     self._record_answer(message.param_id)
                     self._absent.add(message.param_id)
                     self._decide()
@@ -146,11 +147,8 @@ class ChannelSelector:
             self._decide()
 
     @property
-    def _table(self) -> ParameterTable | None:
-        return TABLES.get(self._autopilot)
-
-    def _list_all_names(self) -> frozenset[str]:
-        return self._table.all_names if self._table else frozenset()
+    def _table(self) -> ParameterTable:
+        return TABLES.get(self._autopilot, _EMPTY_TABLE)
 
     def _is_known(self, name: str) -> bool:
         names = {name, ALTERNATIVES.get(name) or name}
@@ -159,8 +157,7 @@ class ChannelSelector:
     def _find_missing(self) -> list[str]:
         """Return the names to request: those that determine the channel, then those that it requires, then the rest,
         in each group those requested least often first. An alternative name is requested if the first has no answer."""
-        if not (table := self._table):
-            return []
+        table = self._table
         needed = table.list_needed(table.choose(self._kind, self._values))
         rank = dict.fromkeys(needed, 1) | dict.fromkeys(table.deciding, 0)
         missing: list[tuple[int, int, str]] = []
@@ -184,16 +181,14 @@ class ChannelSelector:
         """Choose the channel again, and report it if the decision has changed."""
         if not self._has_begun:
             return
-        table = self._table
-        decision = table.decide(self._kind, self._values, self._is_known) if table else Decision(_DEFAULT_CHOICE)
-        self._decision = decision
+        self._decision = decision = self._table.decide(self._kind, self._values, self._is_known)
         if not decision.missing and decision != self._reported:
-            self._report(decision, table.name if table else "unknown firmware")
+            self._report(decision)
             self._reported = decision
 
-    def _report(self, decision: Decision, firmware: str) -> None:
+    def _report(self, decision: Decision) -> None:
         version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
-        vehicle, choice = f"{firmware}{version} on a {self._kind.value}", decision.choice
+        vehicle, choice = f"{self._table.name}{version} on a {self._kind.value}", decision.choice
         faults = list(decision.faults)
         if choice.channel is Channel.NONE:
             log.warning("%s: %s", vehicle, choice.reason)
