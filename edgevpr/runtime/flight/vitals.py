@@ -30,6 +30,7 @@ _CAMERA_START_TIMEOUT_S = 10.0
 _QUERY_TIMEOUT_S = 45.0
 _QUERY_TIMEOUT_INTERVALS = 3
 _FAULTS = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
+_QUERY_FIELDS = ("query", "accepted", "reason", "place", "reference_image", "score", "accuracy_m")  # of the status
 
 _log = logging.getLogger(__name__)
 
@@ -70,7 +71,9 @@ class Vitals:
         """Store an event for the status if it is a query."""
         self._has_event = True
         if event.frame and event.is_query:
-            self._newest = {"t_frame_s": event.frame.t_mono_s, **_summarise(event)}
+            fields, confidence = to_fields(event), combine_confidence(event)
+            newest = {"t_frame_s": event.frame.t_mono_s, **{name: fields[name] for name in _QUERY_FIELDS}}
+            self._newest = newest | {"confidence": confidence}
             self._match = self._newest if event.accepted else self._match
 
     def beat(self) -> None:
@@ -184,10 +187,3 @@ class Vitals:
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []
         return {**status, "summary": "; ".join((status["source"], counts, *fixes, *status["remarks"]))}
-
-
-def _summarise(event: Recognition) -> dict[str, Any]:
-    """Return the status fields of a query (None: unknown)."""
-    fields = to_fields(event)
-    names = ("query", "accepted", "reason", "place", "reference_image", "score", "accuracy_m")
-    return {name: fields[name] for name in names} | {"confidence": combine_confidence(event)}
