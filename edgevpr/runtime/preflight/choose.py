@@ -22,7 +22,6 @@ from edgevpr.power.equations import Pack
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
-_MAX_OBJECTIONS = 3  # number reported if no option can be chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,12 +168,6 @@ def choose_best(options: Sequence[Option]) -> Option | None:
     suitable = [(option.accuracy, option) for option in options if option.accuracy and option.objection is None]
     _, best = min(suitable, key=lambda pair: (-pair[0].recall_at_1, pair[1].cpu_s), default=(None, None))
     return best
-
-
-def explain_no_choice(options: Sequence[Option], board: Board) -> str:
-    """Return a sentence that explains why `choose_best` returned None."""
-    objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
-    return f"no technique suits {board.title}: {', and '.join(objections)}"
 
 
 @cache

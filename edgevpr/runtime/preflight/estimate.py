@@ -14,11 +14,12 @@ from edgevpr.core.types import QueryCost, StageCost
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import pack_ah, queries_ah
 from edgevpr.power.meter import compute_query_cost
-from edgevpr.runtime.preflight.choose import FlightPlan, Option, choose_best, explain_no_choice, make_option
+from edgevpr.runtime.preflight.choose import FlightPlan, Option, choose_best, make_option
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 from edgevpr.runtime.preflight.trial import Trial
 
 COUNTED_PATH = Path(__file__).with_name("counted.json")
+_MAX_OBJECTIONS = 3  # number reported if no option can be chosen
 _COUNTED = {"w1": 512, "w2": 16, "bins": 8, "entropy": "shannon", "matching": "displacement"}
 
 
@@ -131,7 +132,8 @@ def _recommend(
         return None, "None: no technique can be used on this machine."
     best = choose_best(options)
     if best is None:
-        return None, f"None: {explain_no_choice(options, board)}."
+        objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
+        return None, f"None: no technique suits {board.title}: {', and '.join(objections)}."
     row = rows[options.index(best)]
     return best.label, (
         f"{best.label}: the most accurate that fits: {best.accuracy}; "

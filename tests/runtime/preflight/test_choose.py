@@ -19,7 +19,6 @@ from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight.choose import (
     FlightPlan,
     choose_best,
-    explain_no_choice,
     find_accuracy,
     list_fewer_candidates,
     make_option,
@@ -127,8 +126,8 @@ def test_choose_best_never_returns_one_that_accepted_wrong_places(accuracies):
     assert choose_label(make_board(), COSTS, 100) == "vector"
     accuracies["vector"] = make_accuracy(0.5, wrong=2)
     assert choose_label(make_board(), COSTS, 100) is None
-    why = explain_no_choice(make_options(make_board(), COSTS, 100), make_board())
-    assert re.findall(r"(regions|vector) \w+ (\d) ", why) == [("regions", "1"), ("vector", "2")]
+    objections = [option.objection for option in make_options(make_board(), COSTS, 100)]
+    assert [re.findall(r"\d", objection) for objection in objections] == [["1"], ["2"]]
 
 
 def test_match_scans_a_large_map_whole_and_compares_a_part_of_it():
