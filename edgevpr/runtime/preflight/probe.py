@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from edgevpr.core.arrays import Image
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import NO_COST, Frame, StageCost, StepCosts
@@ -27,7 +26,6 @@ from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.recognition import Recognition
 
 _TRIAL_PICTURES = 2
 _TRIAL_PLACES = 6
@@ -169,7 +167,12 @@ class _Bench:
         times_s = (0.1 * number for number in itertools.count())
 
         def match_pictures() -> list[StepCosts]:
-            return [_match_picture(recogniser, image, next(times_s)).steps for image in self._images]
+            frames = [Frame(image=image, name="trial", t_mono_s=next(times_s)) for image in self._images]
+            events = [recogniser.step(frame) for frame in frames]
+            for event in events:
+                if event.failed:
+                    raise ModelError(str(event.reason))
+            return [event.steps for event in events]
 
         for _ in range(math.ceil((self.sequence - 1) / len(self._images))):
             match_pictures()  # fill the sequence before measuring
@@ -180,13 +183,6 @@ class _Bench:
             StepCosts(**{name: _find_least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
         ]
-
-
-def _match_picture(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:
-    event = recogniser.step(Frame(image=image, name=f"trial {t_mono_s:.1f}", t_mono_s=t_mono_s))
-    if event.failed:
-        raise ModelError(str(event.reason))
-    return event
 
 
 def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
