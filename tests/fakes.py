@@ -16,7 +16,7 @@ from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import Fixes, FixTransmission
-from edgevpr.mavlink.ground import CommandRequest, UserCommand
+from edgevpr.mavlink.ground import UserCommand
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, make_status_text
 from edgevpr.mavlink.peer import Listener
@@ -180,14 +180,14 @@ class FakeLink:
     def take_interim_fixes(self):
         return []
 
-    def take_command(self) -> CommandRequest | None:
+    def take_command(self) -> tuple[UserCommand, str] | None:
         wish, self._wish = self._wish, None
         return wish
 
     def send_command(self, wish: UserCommand) -> str:
         if not self._is_under_way:
             return "TEMPORARILY_REJECTED"
-        self._wish = CommandRequest(wish, "255/190")
+        self._wish = wish, "255/190"
         return "ACCEPTED"
 
     def set_health(self, health: Health) -> None:

@@ -4,7 +4,6 @@ can carry out, such as a pause. Used by `conversation` and the flight."""
 import math
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple
 
 from edgevpr.mavlink.messages import Severity, make_status_text
 from edgevpr.mavlink.wire import Message, mavlink
@@ -22,13 +21,6 @@ class UserCommand(IntEnum):
     RESUME = 2
 
 
-class CommandRequest(NamedTuple):
-    """A command and its sender, as "SYSTEM_ID/COMPONENT_ID"."""
-
-    command: UserCommand
-    sender: str
-
-
 class Requests:
     """Answers requests received over the link, and stores the newest command until the flight's main loop takes it.
     Commands are rejected until `is_flying` is set. Other messages to us, of an unknown kind or above the rate limit,
@@ -37,11 +29,12 @@ class Requests:
     def __init__(self) -> None:
         self.is_flying = False
         self.is_paused = False
-        self._waiting: CommandRequest | None = None
+        self._waiting: tuple[UserCommand, str] | None = None
         self._second_s, self._answered = 0.0, 0
 
-    def take(self) -> CommandRequest | None:
-        """Return the newest command received since the last call (None: none)."""
+    def take(self) -> tuple[UserCommand, str] | None:
+        """Return the newest command received since the last call and its sender, as "SYSTEM_ID/COMPONENT_ID"; None if
+        there is none."""
         waiting, self._waiting = self._waiting, None
         return waiting
 
@@ -68,7 +61,7 @@ class Requests:
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
         command = UserCommand(int(code))
         self.is_paused = command is UserCommand.PAUSE
-        self._waiting = CommandRequest(command, f"{sender[0]}/{sender[1]}")
+        self._waiting = command, f"{sender[0]}/{sender[1]}"
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _may_answer(self, now_s: float) -> bool:

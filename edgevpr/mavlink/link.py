@@ -10,7 +10,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.fixes import FixTransmission
-from edgevpr.mavlink.ground import CommandRequest
+from edgevpr.mavlink.ground import UserCommand
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
@@ -97,7 +97,7 @@ class Link:
         with self.take_turn("take_between"):
             return self.conversation.take_interim_fixes()
 
-    def take_command(self) -> CommandRequest | None:
+    def take_command(self) -> tuple[UserCommand, str] | None:
         with self.take_turn("take_wishes"):
             return self.conversation.requests.take()
 

@@ -5,7 +5,7 @@ import logging
 from typing import Any
 
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.ground import CommandRequest, UserCommand
+from edgevpr.mavlink.ground import UserCommand
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -80,14 +80,14 @@ class Commands:
         if self._link is None:
             return
         if request := self._link.take_command():
-            self._carry_out(request)
+            self._carry_out(*request)
         self._link.accept_commands()
 
-    def _carry_out(self, request: CommandRequest) -> None:
-        was_paused, self.is_paused = self.is_paused, request.command is UserCommand.PAUSE
+    def _carry_out(self, command: UserCommand, sender: str) -> None:
+        was_paused, self.is_paused = self.is_paused, command is UserCommand.PAUSE
         code = ReasonCode.PAUSED_BY_COMMAND if self.is_paused else ReasonCode.RESUMED_BY_COMMAND
-        name, is_new = request.command.name, self.is_paused != was_paused
-        self._notifier.log("command", command=name, sender=request.sender, note=Reason(code), is_new=is_new)
+        is_new = self.is_paused != was_paused
+        self._notifier.log("command", command=command.name, sender=sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary
-            self._notifier.announce(Severity.INFO, f"{text} by {request.sender}", gcs_text=text, topic="pause")
+            self._notifier.announce(Severity.INFO, f"{text} by {sender}", gcs_text=text, topic="pause")
