@@ -2,7 +2,6 @@
 is matched with only part of its area, which would make positions wrong by tens of metres."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError
@@ -57,7 +56,8 @@ def correlate_halves(image: Image, side: str) -> tuple[float, float]:
     is_vertical = side == _HALVES[1]
     copy = resize(image, _COPY_PX)
     grey = copy if copy.ndim == 2 else copy[:, :, 1]
-    first, second = (_extract_detail(half) for half in np.array_split(grey, 2, 0 if is_vertical else 1))
+    halves = np.array_split(grey.astype(np.float32), 2, 0 if is_vertical else 1)
+    first, second = (half - cv2.GaussianBlur(half, (0, 0), _DETAIL_SIGMA_PX) for half in halves)
     height, width = first.shape
     dy, dx = height // 4, width // 4
     middle = second[dy:-dy, dx:-dx]
@@ -70,8 +70,3 @@ def correlate_halves(image: Image, side: str) -> tuple[float, float]:
     is_off_peak = np.hypot(rows - row, columns - column) > _PEAK_RADIUS_PX
     best = max(0.0, float(correlations[row, column]))
     return best, best - float(correlations[is_off_peak].max())
-
-
-def _extract_detail(half: Image) -> NDArray[np.float32]:
-    grey = half.astype(np.float32)
-    return grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL_SIGMA_PX)

@@ -62,7 +62,9 @@ def find_good_blocks(grey: Bytes, kind: str, cell_px: int, threshold: float, eli
     small = _make_shannon_copy(grey)
     # The entropy of the lower four bits is a lower bound. In a range of 16 k values, the upper bits add at most log2 k.
     entropy = _compute_shannon_map(small & 15)
-    upper = entropy + _LOG2_OVER_8[(_compute_range(small) >> 4) + 1]
+    square = np.ones((2 * DISC_RADIUS_PX + 1,) * 2, np.uint8)  # around the disc of each pixel
+    intensity_range: Array = cv2.subtract(cv2.dilate(small, square), cv2.erode(small, square))
+    upper = entropy + _LOG2_OVER_8[(intensity_range >> 4) + 1]
     down, across = (_make_block_matrix(side, cell_px) for side in grey.shape)
 
     def average(values: Array) -> Singles:
@@ -92,12 +94,6 @@ def _make_block_matrix(side_px: int, cell_px: int) -> Singles:
     cells = side_px // cell_px
     pairs = np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)
     return (pairs / 2) @ enlargement.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
-
-
-def _compute_range(grey: Bytes) -> Array:
-    """Return, for each pixel, the largest minus the smallest intensity in the square around its disc: uint8 (H, W)."""
-    square = np.ones((2 * DISC_RADIUS_PX + 1,) * 2, np.uint8)
-    return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
 def _count_distinct(padded: Array) -> Array:

@@ -292,5 +292,4 @@ def _integrate_drift(motion_s: Doubles, growth_m2_s2: Doubles, elapsed_s: Double
     sums = np.cumsum(growth_m2_s2), np.cumsum(growth_m2_s2 * motion_s), np.cumsum(growth_m2_s2 * motion_s**2)
     zeroth, first, second = (np.interp(earlier_s, motion_s, total) for total in sums)
     one_s, other_s = elapsed_s[:, :, None], elapsed_s[:, None, :]
-    drift_m2: Doubles = zeroth * one_s * other_s - first * (one_s + other_s) + second
-    return drift_m2
+    return np.asarray(zeroth * one_s * other_s - first * (one_s + other_s) + second)

@@ -230,8 +230,7 @@ def fit_samples(samples: list[SurveySample]) -> tuple[Doubles, Doubles, Bools]:
 
 def _compute_tangents(mount: Mount) -> Doubles:
     """Return the tangents of a mount (2,), ahead and to the right."""
-    tangents: Doubles = np.tan(np.radians((mount.ahead_deg, mount.right_deg)))
-    return tangents
+    return np.asarray(np.tan(np.radians((mount.ahead_deg, mount.right_deg))))
 
 
 def _is_gps_plausible(samples: list[SurveySample], is_inlier: Bools, to_middle: Doubles, mount: Doubles) -> bool:
