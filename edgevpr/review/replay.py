@@ -18,15 +18,7 @@ from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
 from edgevpr.power.thermal import ThermalWatch
-from edgevpr.review.tape import (
-    PacketComparison,
-    Playback,
-    ReplayedDriver,
-    ReplayedSigning,
-    ReplayedSource,
-    TapeEnded,
-    read_tape,
-)
+from edgevpr.review import tape
 from edgevpr.runtime.flight.boundary import TapedStop, TapedTurns, tape_clock, tape_machine
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import Flight
@@ -52,7 +44,7 @@ class ReplayResult:
 
     flown: list[Line]
     lines: list[Line]
-    packets: PacketComparison
+    packets: tape.PacketComparison
     why_ended: str | None
     guessed: int
 
@@ -62,7 +54,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     name next to the log. `place_map`: path of its map (None: its recorded path). Raises UsageError if there is no
     recording, and EdgevprError if the recording or the map cannot be opened."""
     flown, folder = read_recorded(log)
-    notes = read_tape(folder / TAPE)
+    notes = tape.read_tape(folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
         raise EdgevprError(f"{folder / TAPE} is not a flight tape, or ends within its first line: nothing to replay.")
@@ -76,7 +68,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     place_map = place_map or config.map
     if place_map and not Path(place_map).exists():
         raise UsageError(f"{place_map}, the map of the flight, does not exist: pass its path with --map.")
-    playback = Playback(notes)
+    playback = tape.Playback(notes)
     recorded = build(Board, _drop_unknown_settings(header["board"], Board), "the board of the flight")
     board = resolve_board(recorded, config.source, config.memory)
     why_ended = None
@@ -88,10 +80,10 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             log=replace(config.log, path=replay_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
             machine=tape_machine(Machine(measure_heat=ThermalWatch(hot_c=board.thermal_limit_c).read), playback),
-            open_source=lambda step_s: ReplayedSource(playback, partial(_read_frame, folder)),
+            open_source=lambda step_s: tape.ReplayedSource(playback, partial(_read_frame, folder)),
             turns=TapedTurns(Clock().mono_s, playback),
-            drive=partial(ReplayedDriver, playback),
-            signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
+            drive=partial(tape.ReplayedDriver, playback),
+            signing=tape.ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
             stop=TapedStop(playback),
             status=None,
             recording=header["recording"],
@@ -101,7 +93,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
         try:
             with closing(Flight.open(config, io)) as flight:
                 flight.run()
-        except TapeEnded as end:
+        except tape.TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
         finally:
             logging.disable(logging.NOTSET)
@@ -121,7 +113,7 @@ def _read_frame(folder: Path, number: int) -> Image:
     try:
         return read_image(frame_path(folder, number))
     except ImageError as error:
-        raise TapeEnded(str(error)) from None
+        raise tape.TapeEnded(str(error)) from None
 
 
 def _drop_unknown_settings(recorded: dict[str, Any], kind: type, prefix: str = "") -> dict[str, Any]:
