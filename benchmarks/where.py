@@ -31,6 +31,7 @@ from edgevpr.places.mapfile import PlaceMap
 SETS = ("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "aerial_brighton")
 _PAIR_SD = (0.01, 0.05)  # of a registered pair: shift, as a share of the longest side; log of scale and rotation
 _NEAREST_PICTURES = 4
+ON_GIMBAL = ("aerial_brighton",)  # says its README
 NADIR_FLAGS = ("--technique", "cohog", "--camera", "nadir")
 REFINE_FLAGS = {"before": ("--no-refine",), "after": ()}
 SEEDS = (11, 12, 13)
@@ -100,11 +101,13 @@ def read_set_image(folder: Path, name: str) -> np.ndarray:
 
 def measure_set(folder: Path, work: Path) -> tuple[Row, dict[str, Place], AerialSet]:
     """Map and match a set with and without refining; return its row, the refined places by picture, and the set."""
-    site, matches = load_set(folder), {}
+    site, matches, config = load_set(folder), {}, work / "config.yaml"
+    config.write_text(f"source: {{gimbal: {str(folder.name in ON_GIMBAL).lower()}}}")
     for stage, flags in REFINE_FLAGS.items():
         path = work / f"{folder.name}_{stage}.gpkg"
-        built = base.run_edgevpr("map", "build", path, "--images", folder / "ref", *NADIR_FLAGS, *flags)
-        matches[stage] = base.run_edgevpr("match", path, "--images", folder / "query")
+        images, setup = folder / "ref", ("--config", config)
+        built = base.run_edgevpr("map", "build", path, "--images", images, *NADIR_FLAGS, *flags, *setup)
+        matches[stage] = base.run_edgevpr("match", path, "--images", folder / "query", *setup)
     with PlaceMap.open(path) as place_map:
         places = {place.source_image: place for place in place_map.read_places()}
     errors, variances = _compute_errors(site, matches, places)

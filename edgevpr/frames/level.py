@@ -246,7 +246,9 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
     if tilt_deg > MAX_TILT_UNLEVELLED_DEG:
         return View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": tilt_deg}))
     if heading_deg is None or height_m is None or not 0 <= height_m <= _MAX_HEIGHT_M:
-        return UNKNOWN_VIEW
+        # Without tilt the image's middle is the nadir, whatever its heading, height and lens (at least 53 degrees).
+        is_level = tilt_deg < _MIN_TILT_DEG
+        return View(nadir_offset=(0.0, 0.0), nadir_offset_sd=REPORTED_TILT_SD) if is_level else UNKNOWN_VIEW
     heading = math.radians(heading_deg)
     north = height_m / down * (forward * math.cos(heading) - right * math.sin(heading))
     east = height_m / down * (forward * math.sin(heading) + right * math.cos(heading))

@@ -47,7 +47,7 @@ class Levelling:
     from the `mount` of the camera. A `lens` has its own mount.
 
     With `below`, for places, the point below the camera becomes the centre. `is_on_gimbal`: a gimbal keeps the camera
-    level. `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
+    level, unless the frame itself has other angles. `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
     """
 
     lens: Lens | None = field(kw_only=False)
@@ -76,8 +76,8 @@ class Levelling:
         much ground as expected at its height or, if that is unknown, as the images of the map."""
         if vehicle and not (self.is_live and vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
-        if vehicle and self.is_on_gimbal:
-            vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
+        if self.is_on_gimbal and None in (frame.roll_deg, frame.pitch_deg):
+            frame = replace(frame, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
             return enlarge_image(
                 LevelledImage(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale
@@ -105,17 +105,16 @@ class Undistortion:
 def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Undistortion | None:
-    """Make the image preparation for a configuration; None for a camera of unknown lens that looks ahead or is on a
-    gimbal. Raises ConfigError for an unusable calibration, UsageError for a field of view that contradicts it."""
+    """Make the image preparation for a configuration; None for a camera of unknown lens that looks ahead. Raises
+    ConfigError for an unusable calibration, UsageError for a field of view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
         calibrated = load_calibrated_lens(config)
         return Undistortion(calibrated) if calibrated else None
-    lens, mount = read_camera_lens(config), read_mount(config)
+    lens = read_camera_lens(config)
     if lens is None:
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
-        if config.gimbal and mount == STRAIGHT_DOWN:
-            return None
-    return Levelling(lens, below=below, is_on_gimbal=config.gimbal, is_live=is_live(config.uri), mount=mount)
+    is_on_gimbal, mount = config.gimbal, read_mount(config)
+    return Levelling(lens, below=below, is_on_gimbal=is_on_gimbal, is_live=is_live(config.uri), mount=mount)
 
 
 def read_camera_lens(config: SourceConfig) -> Lens | None:

@@ -182,11 +182,11 @@ def test_centre_place_has_no_pose_without_height_or_heading(view):
     [
         ("nadir", {"source.fov_deg": 66.0}, Levelling),
         ("nadir", {}, Levelling),
-        ("nadir", {"source.gimbal": True}, type(None)),
+        ("nadir", {"source.gimbal": True}, Levelling),
         ("forward", {"source.fov_deg": 66.0}, type(None)),
     ],
 )
-def test_make_levelling_requires_a_downward_camera_with_a_known_lens(camera, settings, kind, caplog):
+def test_make_levelling_requires_a_downward_camera(camera, settings, kind, caplog):
     config = load_config(None, settings)
     with caplog.at_level(logging.INFO):
         made = make_levelling(config.source, create("cohog", {"camera": camera}))
@@ -226,6 +226,20 @@ def test_prepare_ignores_the_attitude_with_a_gimbal():
     fixed = Levelling(Lens(66.0), is_live=True).prepare(frame, level, None)
     assert hung.view == fixed.view
     assert np.array_equal(hung.image, fixed.image)
+
+
+@pytest.mark.parametrize("lens", [LENS, None])
+def test_prepare_knows_the_tilt_of_a_recorded_image_of_a_gimbal(lens):
+    frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0)
+    views = [
+        Levelling(lens, is_on_gimbal=is_on_gimbal, is_live=False).prepare(each, None, None).view
+        for is_on_gimbal in (True, False)
+        for each in (frame, replace(frame, roll_deg=0.0, pitch_deg=40.0))
+    ]
+    straight, tilted, unknown, _ = views
+    assert straight.nadir_offset == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert tilted.reason if lens is None else tilted.nadir_offset[1] < -0.3, "its own angles count"
+    assert not unknown.is_tilt_known
 
 
 @pytest.mark.parametrize("fov_deg", [LENS.fov_deg, None])
