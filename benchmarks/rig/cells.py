@@ -69,15 +69,18 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One flight: the names of its set-up and event, and the kind of its matches (of MATCHES; "" without edgevpr)."""
+    """One flight: the names of its set-up and event, and the kind of its matches (of MATCHES; "" without edgevpr). It
+    may be flown several times, with different `number`s."""
 
     set_up: str
     event: str
     matches: str = ""
+    number: int = 1
 
     @property
     def name(self) -> str:
-        return "-".join(filter(None, (self.set_up, self.event, self.matches)))
+        name = "-".join(filter(None, (self.set_up, self.event, self.matches)))
+        return name if self.number == 1 else f"{name}.{self.number}"
 
     @property
     def has_edgevpr(self) -> bool:

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import astuple, replace
 from itertools import count
 from pathlib import Path
 
@@ -29,7 +30,7 @@ import simulator
 from cells import CELLS, SET_UPS, Flight
 from rig import WORK
 from trial import Trial
-from verdicts import compute_flight_figures, format_page, judge_cells
+from verdicts import MAX_CONTROLS, combine_controls, compute_flight_figures, format_page, judge_cells
 
 KEPT_FOLDER = WORK / "never_worse"
 _FIRST_INSTANCE = 1  # of a simulator: instance 0 and its ports are left to rig.py
@@ -43,10 +44,11 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the names of the cells")
     parser.add_argument("--report", action="store_true", help="fly nothing; write the page from the kept results")
     parser.add_argument("--workers", type=int, default=2, help="flights at the same time (default: 2)")
-    parser.add_argument("--flight", nargs=3, help=argparse.SUPPRESS)  # set-up, event, matches
+    parser.add_argument("--flight", nargs=4, help=argparse.SUPPRESS)  # set-up, event, matches, number
     arguments = parser.parse_args()
     if arguments.flight:
-        fly_and_keep(Flight(*arguments.flight))
+        set_up, event, matches, number = arguments.flight
+        fly_and_keep(Flight(set_up, event, matches, int(number)))
         return
     if arguments.list:
         print("\n".join(CELLS))
@@ -57,6 +59,9 @@ def main() -> None:
     if not arguments.report:
         require_simulators(names)
         fly_cells(names, set(arguments.cells or ()), arguments.workers)
+        worse = [row["cell"] for row in judge_cells(read_kept_rows()) if row["cell"] in names and not row["is_right"]]
+        numbers = range(2, MAX_CONTROLS + 1)
+        fly([replace(CELLS[name].control, number=number) for name in worse for number in numbers], arguments.workers)
     rows = read_kept_rows()
     cells = [row for row in judge_cells(rows) if arguments.report or row["cell"] in names]
     for row in cells:
@@ -83,21 +88,29 @@ def find_row_path(flight: Flight) -> Path:
 
 
 def read_kept_rows() -> dict[str, base.Row]:
-    """Return the kept figures by the name of the flight."""
-    flights = {flight.name: flight for cell in CELLS.values() for flight in (cell.flight, cell.control)}
-    paths = {name: find_row_path(flight) for name, flight in flights.items()}
-    return {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}
+    """Return the kept figures by the name of the flight, of a control those of all its flights."""
+    rows = {}
+    for cell in CELLS.values():
+        controls = [find_row_path(replace(cell.control, number=number)) for number in range(1, MAX_CONTROLS + 1)]
+        for flight, paths in ((cell.flight, [find_row_path(cell.flight)]), (cell.control, controls)):
+            if paths[0].exists():
+                rows[flight.name] = combine_controls([json.loads(path.read_text()) for path in paths if path.exists()])
+    return rows
 
 
 def fly_cells(names: list[str], again: set[str], workers: int) -> None:
     """Fly these cells and their controls, `workers` at a time, but those with results only if in `again`."""
     flights = {flight.name: flight for name in names for flight in (CELLS[name].control, CELLS[name].flight)}
-    due = [flight for name, flight in flights.items() if name in again or not find_row_path(flight).exists()]
+    fly([flight for name, flight in flights.items() if name in again or not find_row_path(flight).exists()], workers)
+
+
+def fly(due: list[Flight], workers: int) -> None:
+    """Make these flights, `workers` at a time."""
     for mapped_m in {flight.make_scenario().mapped_m for flight in due}:  # not by two flights at once
         ground.build_place_map(WORK, 100.0, mapped_m)
 
     def fly_one(flight: Flight) -> None:
-        arguments = (flight.set_up, flight.event, flight.matches)
+        arguments = map(str, astuple(flight))
         process = subprocess.run([sys.executable, __file__, "--flight", *arguments], check=False)
         if process.returncode:
             print(f"never_worse: {flight.name} exited with code {process.returncode}", file=sys.stderr, flush=True)

@@ -93,14 +93,8 @@ class Px4(Process):
         self.link.upload_mission(items or _make_mission(self._vehicle, height_m))
         flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self.link.command(mavlink.MAV_CMD_DO_SET_MODE, flag, _AUTO_MODE, _MISSION_MODE)
-        for _ in range(30):
-            if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
-                break
-            time.sleep(1)
-        else:
-            raise RuntimeError("PX4 does not arm")
-        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 950 * height_m, 180):
-            raise RuntimeError(f"the aircraft did not reach {height_m:.0f} m")
+        self._arm()
+        self.wait_height(0.95 * height_m)
 
     def set_gps(self, is_on: bool) -> None:
         self.set_satellites(10 if is_on else 0)

@@ -93,6 +93,18 @@ class Process:
         for number, rate_hz in streams_hz.items():
             self.link.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
 
+    def _arm(self) -> None:
+        for _ in range(30):
+            if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
+                return
+            time.sleep(1)
+        raise RuntimeError("the autopilot does not arm")
+
+    def wait_height(self, height_m: float) -> None:
+        """Wait until the aircraft is at `height_m`. Raises RuntimeError after three minutes."""
+        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 1000 * height_m, 180):
+            raise RuntimeError(f"the aircraft did not reach {height_m:.0f} m")
+
     def kill(self) -> None:
         """Kill the process, as a loss of power would."""
         if self.link:
@@ -164,20 +176,11 @@ class Simulator(Process):
     def arm(self, mode: str) -> None:
         """Set the mode and arm. Raises RuntimeError if the autopilot refuses to arm."""
         self.set_mode(mode)
-        for _ in range(20):
-            if self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == mavlink.MAV_RESULT_ACCEPTED:
-                return
-            time.sleep(1)
-        raise RuntimeError("the autopilot does not arm")
+        self._arm()
 
     def set_mode(self, mode: str) -> None:
         number = self.vehicle.modes[mode]
         self.link.command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number)
-
-    def wait_height(self, height_m: float) -> None:
-        """Wait until the aircraft is at `height_m`. Raises RuntimeError after three minutes."""
-        if not self.link.wait_for("GLOBAL_POSITION_INT", lambda message: message.relative_alt > 1000 * height_m, 180):
-            raise RuntimeError(f"the aircraft did not reach {height_m:.0f} m")
 
     def set_gps(self, is_on: bool) -> None:
         self.link.set_parameter("SIM_GPS1_ENABLE", int(is_on))

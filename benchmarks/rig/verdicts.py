@@ -19,6 +19,7 @@ from edgevpr.runtime.flight.flightlog import read_log
 # Limits for how much worse than its control a flight with edgevpr may be.
 MARGIN_M = 3.0
 MARGIN_S = 5.0
+MAX_CONTROLS = 3  # flights of a control, if a flight is worse than the first: chance moves one that lands blind
 FIRST_POSITION_S = 60.0  # after a start of the autopilot, which itself needs 25 s to get a position
 _GPS_ERROR_M = 5.0  # the estimate uses GPS again once its error stays below this
 _DISTANCES = {"strayed_m": "strays {:.0f} m", "sank_m": "sinks {:.0f} m", "error_m": "estimate {:.0f} m off"}
@@ -34,6 +35,7 @@ _COLUMNS = {
     "alone    ": "{control[on_gps_s]}",
     "sent": "{with[sent]}",
     "accepted": "{with[accepted]}",
+    "controls": "{control[flights]}",
     "verdict": "{verdict}",
 }
 
@@ -116,6 +118,15 @@ def find_faults(figures: Row, control: Row) -> list[str]:
     return faults
 
 
+def combine_controls(rows: list[Row]) -> Row:
+    """Return the largest figures of several flights of one control; None, which is never on GPS again, is larger."""
+    numbers = {"flights": len(rows)}
+    for key in (*_DISTANCES, "on_gps_s"):
+        if values := [row[key] for row in rows if key in row]:
+            numbers[key] = None if None in values else max(values)
+    return rows[0] | numbers
+
+
 def is_refused(figures: Row) -> bool:
     """Return True if edgevpr has warned, and has sent nothing in the watched time or the aircraft stayed on the ground.
     The message on a busy computer is a notice, not a warning."""
@@ -154,7 +165,10 @@ Largest values of that time in metres, each followed by that of the control (alo
 planned path, loss of height, and error of the autopilot's estimate. Then the seconds from the return of GPS until this
 error stays within {_GPS_ERROR_M:.0f} m, the number of positions sent, and the queries accepted in the whole flight.
 
-Right: compared with the control, no distance is more than {MARGIN_M:.0f} m worse, and GPS is used again at most
+A flight that is worse than its control is compared with the largest values of {MAX_CONTROLS} controls: where an
+aircraft lands blind, chance moves it by tens of metres.
+
+Right: compared with the controls, no distance is more than {MARGIN_M:.0f} m worse, and GPS is used again at most
 {MARGIN_S:.0f} s later; positions come within {FIRST_POSITION_S:.0f} s of a start of the autopilot, none while paused.
 Refused: edgevpr has warned, and it sends nothing or the aircraft does not arm.
 

@@ -38,6 +38,12 @@ def test_controls_are_shared():
     assert CELLS["px4_sensor-home_set-right"].control.name == "px4_sensor-gps_off_late-right"
 
 
+def test_combine_controls_returns_the_largest_figures():
+    landed = CONTROL_ROW | {"strayed_m": 40.0, "on_gps_s": None}
+    assert verdicts.combine_controls([CONTROL_ROW, landed]) == landed | {"flights": 2}
+    assert verdicts.combine_controls([CONTROL_ROW | {"cannot": "never ready"}])["flights"] == 1
+
+
 @pytest.mark.parametrize(
     ("changed", "verdict"),
     [
