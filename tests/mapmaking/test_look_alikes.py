@@ -83,13 +83,13 @@ def test_measure_look_alikes_treats_neighbours_along_a_route_as_the_same_ground(
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_look_alikes_refuse_a_door_that_resembles_its_twin(tmp_path, known):
+def test_a_door_that_resembles_its_twin_is_refused(tmp_path, known):
     with open_map(tmp_path, make_single_views()) as (place_map, look_alikes):
         rule = make_accept_rule(AHEAD, load_config(None).match)
         walk = walk_over(place_map, AHEAD, replace(rule, look_alikes=look_alikes) if known else rule)
         event = walk.step(Frame(image=change_light(make_door_view(50, SPOT_PX)), name="query", t_mono_s=0.0))
         assert event.best.place.place_id == SECOND, "the regions prefer the wrong door"
-        assert event.accepted != known
+        assert not event.accepted
         assert (event.confidence <= 0.5) == known
 
 

@@ -47,7 +47,8 @@ class Levelling:
     from the `mount` of the camera. A `lens` has its own mount.
 
     With `below`, for places, the point below the camera becomes the centre. `is_on_gimbal`: a gimbal keeps the camera
-    level, unless the frame itself has other angles. `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
+    level, unless the frame itself has other angles. `is_live` is False for recorded frames, for which the autopilot's
+    reports do not apply.
     """
 
     lens: Lens | None = field(kw_only=False)

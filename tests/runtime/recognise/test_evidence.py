@@ -88,7 +88,7 @@ def test_gather_evidence_compares_with_the_most_similar_place(overlap):
     assert known.twins == 1
 
 
-CLEAR_LEAD = replace(see_forward({5: forward(0.2)}), lead=math.log(1.51), rank_gap=0.0)
+CLEAR_LEAD = replace(see_forward({5: forward(0.2)}), lead=math.log(1.51), rank_gap=0.0, twin=-0.1)
 SMALL_LEAD = replace(CLEAR_LEAD, lead=math.log(1.49))
 
 
@@ -96,6 +96,10 @@ SMALL_LEAD = replace(CLEAR_LEAD, lead=math.log(1.49))
     ("evidence", "needed"),
     [
         (CLEAR_LEAD, False),
+        (replace(CLEAR_LEAD, twin=None), True),
+        (replace(CLEAR_LEAD, twin=None, proof=log_inlier_ratio(9, 3)), False),
+        (replace(CLEAR_LEAD, twin=None, lead=math.log(3.99)), True),
+        (replace(CLEAR_LEAD, twin=None, lead=math.log(4.01)), False),
         (SMALL_LEAD, True),
         (replace(SMALL_LEAD, landmarks=log_count(8)), True),
         (replace(SMALL_LEAD, landmarks=log_count(9)), False),

@@ -75,7 +75,7 @@ def test_cap_confidence_shows_no_more_than_the_data_support():
 
 def test_judge_requires_landmarks_or_track_for_weak_forward_regions():
     rule = make_rule(lambda evidence: 1.0, needed=0.9999)
-    hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3)
+    hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3, twin=-0.1)
     assert rule.confidence_rule.confidence(hardly) == 0.9
     assert not decide(rule=rule, evidence=hardly).accepted
     assert decide(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
