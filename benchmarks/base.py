@@ -54,19 +54,20 @@ def describe_run() -> Row:
 @cache
 def read_commit(repository: Path = REPOSITORY) -> str:
     """Return the commit of a repository, followed by " with changes" if edgevpr/ or models/ differ from it."""
-    if not shutil.which("git"):
-        return "unknown"
-    commands = (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--", "edgevpr", "models"))
-    git = ("git", "-C", str(repository))
-    head, changed = (subprocess.run([*git, *args], capture_output=True, text=True).stdout.strip() for args in commands)
-    return head + (" with changes" if changed else "") or "unknown"
+    is_changed = bool(_run_git(repository, "status", "--porcelain", "--", "edgevpr", "models"))
+    return _run_git(repository, "rev-parse", "--short", "HEAD") + " with changes" * is_changed or "unknown"
 
 
 def read_program_commit(repository: Path) -> str:
     """Return the last commit that changed edgevpr/ or models/: no other file changes the program."""
-    command = ("git", "-C", str(repository), "log", "-1", "--format=%h", "--", "edgevpr", "models")
-    last = subprocess.run(command, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
+    last = _run_git(repository, "log", "-1", "--format=%h", "--", "edgevpr", "models")
     return last + " with changes" * read_commit(repository).endswith("changes") or "unknown"
+
+
+def _run_git(repository: Path, *words: str) -> str:
+    """Return the output of a git command; an empty text if it fails or there is no git."""
+    command = ("git", "-C", str(repository), *words)
+    return subprocess.run(command, capture_output=True, text=True).stdout.strip() if shutil.which("git") else ""
 
 
 def read(name: str, folder: Path = RESULTS) -> Row:

@@ -120,9 +120,7 @@ def gather_rows(work: Path, name: str) -> None:
     if not path.exists():
         work.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory() as temporary:
-            has_sites = (DATA / name / "sites.csv").exists()
-            folder = run_sets.place_sites(DATA / name, Path(temporary)) if has_sites else DATA / name
-            rows = list(yield_rows(name, folder))
+            rows = list(yield_rows(name, run_sets.place_sites(DATA / name, Path(temporary))))
         path.with_suffix(".new").write_bytes(pickle.dumps(rows))
         path.with_suffix(".new").replace(path)
         print(name, len(rows), flush=True)

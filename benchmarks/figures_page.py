@@ -12,12 +12,12 @@ END_MARKER = "<!-- end of figures -->"
 
 
 def main() -> None:
-    contents = sets_page.read_sets(RESULTS)
-    replace_figures(REPOSITORY / "docs" / "figures.md", f"{format_recall(contents)}\n\n{format_speed()}")
+    write_figures(REPOSITORY / "docs" / "figures.md")
 
 
-def replace_figures(page: Path, figures: str) -> None:
-    """Replace the text between the markers of a page by `figures`."""
+def write_figures(page: Path) -> None:
+    """Write the figures between the markers of a page."""
+    figures = f"{format_recall(sets_page.read_sets(RESULTS))}\n\n{format_speed()}"
     before, _, rest = page.read_text(encoding="utf-8").partition(BEGIN_MARKER)
     _, _, after = rest.partition(END_MARKER)
     page.write_text(f"{before}{BEGIN_MARKER}\n{figures}\n\n{END_MARKER}{after}", encoding="utf-8")

@@ -35,10 +35,10 @@ _COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "
 Rng = np.random.Generator
 
 
-def _flip_bits(path: Path, rng: Rng, first: int = 0, end: int | None = None, max_bits: int = 64) -> None:
-    """Flip up to `max_bits` bits of the bytes from `first` to `end`."""
+def _flip_bits(path: Path, rng: Rng, end: int | None = None, max_bits: int = 64) -> None:
+    """Flip up to `max_bits` bits of the bytes before `end` (None: of all)."""
     data = bytearray(path.read_bytes())
-    for offset in rng.integers(first, end or len(data), rng.integers(1, max_bits + 1)):
+    for offset in rng.integers(0, end or len(data), rng.integers(1, max_bits + 1)):
         data[offset] ^= 1 << int(rng.integers(8))
     path.write_bytes(data)
 
@@ -66,7 +66,7 @@ def _flip_position_bits(path: Path, rng: Rng) -> None:
 
 KINDS: dict[str, Callable[[Path, Rng], None]] = {
     "bits flipped": _flip_bits,
-    "bits of the header flipped": lambda path, rng: _flip_bits(path, rng, 0, 100, max_bits=3),
+    "bits of the header flipped": lambda path, rng: _flip_bits(path, rng, 100, max_bits=3),
     "pages overwritten": _overwrite_pages,
     "cut": lambda path, rng: os.truncate(path, int(rng.random() * path.stat().st_size)),
     "bits of a position flipped": _flip_position_bits,

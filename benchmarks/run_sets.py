@@ -10,7 +10,6 @@ import csv
 import json
 import os
 import tempfile
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -88,22 +87,15 @@ def main(argv: list[str] | None = None) -> None:
     folders = base.find_sets(args.data, args.sets.split(",") if args.sets else None)
     variants = find_variants(args.variants.split(";") if args.variants else None)
     args.out.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        folders = [
-            folder
-            if not (folder / "sites.csv").exists()
-            else place_sites(folder, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-placed-"))))
-            for folder in folders
-        ]
+    with tempfile.TemporaryDirectory(prefix="edgevpr-sets-") as work:
+        folders = [place_sites(folder, Path(work)) for folder in folders]
         aerial_folders = [folder for folder in folders if base.infer_camera(folder.name) == "nadir"]
         if len(aerial_folders) > 1:
-            folders.append(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-joined-"))) / JOINED)
+            folders.append(Path(work) / JOINED)
             join_sets(aerial_folders, folders[-1])
         weights = base.REPOSITORY.parent / "shared" / "models" / "calc" / "model.onnx"
         if ORIGINAL_CALC in variants and weights.is_file():
-            write_original_calc(
-                Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="edgevpr-cards-"))), weights
-            )
+            write_original_calc(Path(work), weights)
         else:
             variants = [variant for variant in variants if variant is not ORIGINAL_CALC]
         for folder in folders:
@@ -117,8 +109,11 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def place_sites(folder: Path, work: Path) -> Path:
-    """Copy a set to `work`, and write its positions.csv from its sites.csv, which has the pixel of each picture in the
-    picture of its site. Offsets within a site are exact to the pixel; the positions of the sites are invented."""
+    """Return the folder of a set: `folder` itself or, if that has a sites.csv (with the pixel of each picture in the
+    picture of its site), a copy in `work` with a positions.csv. Offsets within a site are exact to the pixel; the
+    positions of the sites are invented."""
+    if not (folder / "sites.csv").exists():
+        return folder
     out, sites, tags = work / folder.name, [], {}
     out.mkdir()
     for name in ("query", "ref", "ground_truth.csv"):

@@ -107,10 +107,9 @@ def plot_curves(results: Results, path: Path) -> None:
 
 
 def _format_page(contents: list[Row], results: Results, left_out: dict[str, str]) -> str:
-    commits = [", ".join(sorted({row["commit"] for row in _list_rows(content)})) for content in contents]
     origins = [
-        [content["set"], content["use"], content["date"], set_commits]
-        for content, set_commits in zip(contents, commits, strict=True)
+        [content["set"], content["use"], content["date"], ", ".join(sorted({row["commit"] for row in rows}))]
+        for content, rows in zip(contents, map(_list_rows, contents), strict=True)
     ]
     machine = contents[0]["machine"]
     pairs = [

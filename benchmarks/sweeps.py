@@ -41,7 +41,6 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
 SETS = ("aerial_swindale", "corridor")  # one nadir, one forward
-# seqslam is left out: it matches several pictures at once.
 TECHNIQUES = tuple(name for name in techniques.list_techniques() if name != "seqslam")
 WORK = Path("sweeps_work")
 _MAX_STARTS = 24

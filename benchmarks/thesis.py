@@ -44,8 +44,7 @@ def measure_matrices(folder: Path, images: Path) -> dict[str, dict]:
         scores = np.load(path)
         orders = np.argsort(-scores, axis=1, kind="stable")
         ranks = np.array([rank_of_first_correct(*row) for row in zip(orders, correct, strict=True)])
-        quality = compute_quality(scores.max(axis=1), ranks, correct.any(axis=1))
-        figures[name] = {"technique": name, "references": len(references), "unscored": 0, **quality, **published}
+        figures[name] = compute_quality(scores.max(axis=1), ranks, correct.any(axis=1)) | published
     return figures
 
 

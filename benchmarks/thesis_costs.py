@@ -2,7 +2,7 @@
 
 import thesis_values as values
 from base import format_markdown_table
-from thesis_values import MATRICES, ROWS, THESIS, Results, capitalise, compute_table_pcu, format_3g, select_rows
+from thesis_values import MATRICES, ROWS, THESIS, Results, compute_table_pcu, format_3g, select_rows
 
 FLOAT_BYTES = 4
 
@@ -18,7 +18,7 @@ def format_charge() -> str:
         rows.append([name, printed_ah, f"{ours:.4f}", f"{ours / theirs - 1:+.2%}", "yes" if fits else "no"])
     return f"""## Table 5.2: ampere-hours of {table["queries"]} queries
 
-{capitalise(table["source"])}. Here: `edgevpr.power.equations` with the profile `thesis-xeon` and the printed U_e, U_m,
+{table["source"]}. Here: `edgevpr.power.equations` with the profile `thesis-xeon` and the printed U_e, U_m,
 t_e and t_m. The inputs are printed with two to four digits; the last column says whether the printed Ah_t is possible
 with inputs that round to these digits.
 

@@ -1,7 +1,7 @@
 """Sections of docs/thesis.md on the quality of recognition, in the thesis and here, and on memorable maps."""
 
 from base import format_markdown_table
-from thesis_values import MATRICES, ROWS, THESIS, Results, capitalise, select_rows
+from thesis_values import MATRICES, ROWS, THESIS, Results, select_rows
 
 # How the techniques here differ from the author's.
 SMALL = "the small shipped network replaces a large one trained for places or ImageNet"
@@ -69,7 +69,7 @@ def format_precision(results: Results) -> str:
         rows.append([name, spread, *(f"{ours[set_name][name]['precision_at_100_recall']:.2f}" for set_name in sets)])
     return f"""## Table 6.1 and figure 6.7: precision at 100 % recall
 
-{capitalise(table["source"])}. Its five sets ({", ".join(table["sets"])}) are not available: the first column has the
+{table["source"]}. Its five sets ({", ".join(table["sets"])}) are not available: the first column has the
 range of the thesis's values on them. The other columns are other places, so differences to them mean nothing; only the
 order of the techniques on the same set can be compared. Networks here are small replacements of large ones. In aerial
 sets, `cohog` as it flies has a nadir camera and compares rotations, and the thesis's CoHOG does not.

@@ -76,11 +76,6 @@ def format_3g(value: float | None, factor: float = 1.0) -> str:
     return f"{rounded:,.0f}" if rounded >= 1000 else f"{rounded:g}"
 
 
-def capitalise(text: str) -> str:
-    """Return a text with its first letter as a capital."""
-    return text[:1].upper() + text[1:]
-
-
 def half_digit(text: str) -> float:
     """Return half a unit of the last digit of a printed number."""
     return float(Decimal(1).scaleb(Decimal(text).as_tuple().exponent) / 2)
