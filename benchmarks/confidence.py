@@ -50,9 +50,9 @@ _COLUMNS = {
     "ROC AUC, confidence": "{roc_auc:.3f}",
     "calibration error": "{ece:.3f}",
 } | {
-    f"accepted at {precision:g}: right, wrong, beside, foreign": "{at%d[share]:.2f}, {at%d[wrong]}, {at%d[beside]}, "
-    "{at%d[foreign]} of {foreign}".replace("%d", str(number))
-    for number, precision in enumerate(PRECISIONS)
+    f"accepted at {precision:g}: right, wrong, beside, foreign": "{accepted[%s][share]:.2f}, {accepted[%s][wrong]}, "
+    "{accepted[%s][beside]}, {accepted[%s][foreign]} of {foreign}".replace("%s", str(precision))
+    for precision in PRECISIONS
 }
 
 
@@ -133,11 +133,11 @@ def judge_queries(rows: Sequence[Row], models: Models) -> base.Row:
     gaps = np.bincount(bins, confidence - right) / len(own)  # of each bin, weighted by its share of the queries
     result = {"set": rows[0].map, "use": base.find_use(rows[0].map), "queries": len(own), "right": int(right.sum())}
     result |= {"foreign": len(foreign), "roc_auc_score": roc_auc(np.array([row.score for row in own]), right)}
-    result |= {"roc_auc": roc_auc(confidence, right), "ece": float(abs(gaps).sum()), "precision": {}}
+    result |= {"roc_auc": roc_auc(confidence, right), "ece": float(abs(gaps).sum()), "accepted": {}}
     for precision in PRECISIONS:
         accepted = [row for row in own if _is_accepted(models, row, precision)]
-        result["precision"][str(precision)] = {
-            "accepted_right": sum(row.right for row in accepted),
+        result["accepted"][str(precision)] = {
+            "share": sum(row.right for row in accepted) / max(1, result["right"]),
             "wrong": sum(not row.right and not row.near for row in accepted),
             "beside": sum(row.near for row in accepted),
             "foreign": sum(_is_accepted(models, row, precision) for row in foreign),
@@ -196,19 +196,14 @@ def replay_routes(name: str, models: dict[str, Models]) -> base.Row:
 
 def format_page(result: base.Row) -> str:
     """Return the results as Markdown."""
-    for row in result["sets"]:
-        for number, precision in enumerate(PRECISIONS):
-            counts = row["precision"][str(precision)]
-            row[f"at{number}"] = {**counts, "share": counts["accepted_right"] / max(1, row["right"])}
-    default, orders = str(PRECISIONS[-1]), list(result["flights"][0]["ways"])
-    accepted = sum(row["precision"][default]["foreign"] for row in result["sets"])
+    orders = list(result["flights"][0]["ways"])
+    accepted = sum(row["accepted"][str(PRECISIONS[-1])]["foreign"] for row in result["sets"])
     foreign = sum(row["foreign"] for row in result["sets"])
     flights = [
         {"set": flight["set"], "mode": mode, **{key: _format_counts(flight["ways"][key][mode]) for key in orders}}
         for flight in result["flights"]
         for mode in ("alone", "followed")
     ]
-    table = base.format_table([{**row, "precision": None} for row in result["sets"]], _COLUMNS)
     return f"""# Confidence of matches
 
 {base.strip_title(__doc__, "Writes confidence.json")}
@@ -217,9 +212,9 @@ Right: accepted share of the queries whose best place is right. Wrong: accepted 
 Beside: accepted queries whose best place is at most two places from a right one, which the set does not count as right.
 Foreign: accepted queries of other sites.
 
-{table}
+{base.format_table(result["sets"], _COLUMNS)}
 
-At {default}, {accepted} of {foreign} foreign queries are accepted, over all pairs of sets
+At {PRECISIONS[-1]}, {accepted} of {foreign} foreign queries are accepted, over all pairs of sets
 and both cameras.
 
 ## With the place filter

@@ -41,23 +41,20 @@ def fit_shipped_model(kind: str, sites: Sequence[SiteEvidence], made_of: str) ->
         [([evidence for evidence, right in site.own if right], True) for site in sites]
         + [(site.foreign, False) for site in sites],
     )
+    matches = [site.own for site in sites]
+    matches += [[(answer.evidence, answer.right) for answer in site.answers] for site in sites]
     of_place = _fit_regression(
         PLACE_FIGURES[kind],
         [
-            ([evidence for evidence, is_right in site.own if is_right == right], right)
-            for site in sites
-            for right in (True, False)
-        ]
-        + [
-            ([answer.evidence for answer in site.answers if answer.right == right], right)
-            for site in sites
+            ([row for row, is_right in group if is_right == right], right)
+            for group in matches
             for right in (True, False)
         ],
     )
     unfitted = Scale(Tail(0.0, 1.0, 1.0), Tail(0.0, 1.0, 1.0), 1.0, 0.0)
     today = date.today().isoformat()
-    matches = sum(len(site.own) + len(site.foreign) for site in sites)
-    model = Model(of_map=of_map, of_place=of_place, scale=unfitted, made=today, made_of=made_of, matches=matches)
+    count = sum(len(site.own) + len(site.foreign) for site in sites)
+    model = Model(of_map=of_map, of_place=of_place, scale=unfitted, made=today, made_of=made_of, matches=count)
     unadapted = [(site, model) for site in sites]
     adapted = [(site, adapt_model(model, kind, site.answers, site.name)) for site in sites if site.answers]
     return replace(model, scale=_fit_scale(unadapted), adapted_scale=_fit_scale(adapted) if adapted else None)
