@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import base  # noqa: F401
 from base import Row
 from big_map import make_big_map
-from flight_process import read_cpu_s, start, wait_for, watch_memory, write_frames
+from flight_process import finish_flight, read_cpu_s, start, wait_for, watch_memory, write_frames
 
 from edgevpr.techniques import create
 
@@ -57,7 +57,7 @@ def measure_memory(place_map: Path, frames: Path, folder: Path) -> list[Row]:
     """Return the peak memory of a flight of `FRAMES` queries."""
     flight = start(place_map, frames, folder / "memory.jsonl", *LINK_FLAGS, "--rate-hz", "10")
     peak_mb, mapped = watch_memory(flight)
-    assert wait_for_exit(flight) == 0
+    finish_flight(flight)
     for name in FORBIDDEN_LIBRARIES:
         assert name not in mapped, f"{name} was imported"
     return [
@@ -108,7 +108,7 @@ def measure_start_s(place_map: Path, frames: Path, folder: Path) -> float:
     flight = start(place_map, frames, log, *LINK_FLAGS)
     query = wait_for("query", log, flight)
     flight.terminate()
-    assert wait_for_exit(flight) == 0
+    finish_flight(flight)
     return query["t_mono_s"] - begin_s  # one clock for all processes
 
 
@@ -121,7 +121,7 @@ def measure_idle_share(place_map: Path, source: Path | str, log: Path, *flags: s
     time.sleep(IDLE_DURATION_S)
     share = (read_cpu_s(flight.pid) - before_s) / (time.monotonic() - begin_s)
     flight.terminate()
-    assert wait_for_exit(flight) == 0
+    finish_flight(flight)
     return share
 
 
@@ -130,11 +130,3 @@ def drop_cached_pages(path: Path) -> None:
     with open(path, "rb") as file:
         os.fsync(file.fileno())
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
-def wait_for_exit(flight: subprocess.Popen) -> int:
-    """Wait for a flight to end, and return its exit code. Prints the errors of a failed flight."""
-    errors = flight.communicate(timeout=60)[1]
-    if flight.returncode:
-        print(errors, file=sys.stderr)
-    return flight.returncode

@@ -45,8 +45,6 @@ GATES = {
 }
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
-# The answer to a query: slots of the places, best first; their scores; masks of the right and of the ignored slots.
-Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def main() -> None:
@@ -74,7 +72,7 @@ def main() -> None:
             kept = {gate: find_passing([scores[path] for path in places], gate) for gate in GATES}
             for technique in TECHNIQUES:
                 answers = answer_queries(technique, dataset)
-                rows += measure_gates(folder.name, technique, answers, [scores[path] for path in queries], kept)
+                rows += measure_gates(folder.name, technique, *answers, [scores[path] for path in queries], kept)
     result = {**base.describe_run(), "speed": speed, "unseen": unseen, "gate": rows}
     base.write("salience", result, format_page(result))
 
@@ -110,36 +108,32 @@ def measure_frame_times_ms(network: str, detector: Detector | None) -> dict[str,
     return {name: float(np.median(values_ms[1:])) for name, values_ms in times_ms.items()}
 
 
-def answer_queries(name: str, dataset: Dataset) -> list[Answer]:
-    """Map the references with a technique, and return its answers to all queries."""
-    site, answers = dataset.ref_dir.parent.name, []
+def answer_queries(name: str, dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Map the references with a technique, and match all queries. Returns the score of the best place that is not
+    ignored, and whether it is right, for each query, (Q,) each."""
+    site, best_scores, is_right = dataset.ref_dir.parent.name, [], []
     with walks.open_walk(list_images(dataset.ref_dir), name, infer_camera(site) == "nadir") as walk:
         for query in progress(dataset.queries, len(dataset.queries), f"{site}, {name}"):
-            ranking = walk.step(walks.make_frame(query.path)).ranking
-            best = (np.empty(0, int), np.empty(0)) if ranking is None else (ranking.slots, ranking.scores)
-            masks = [np.isin(dataset.references, list(names)) for names in (query.correct, query.ignored)]
-            answers.append((*best, *masks))
-    return answers
-
-
-def score_answers(answers: list[Answer]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the score of the best place that is not ignored, and whether it is right, for each query, (Q,) each."""
-    best_scores, is_right = [], []
-    for slots, scores, right, ignored in answers:
-        is_candidate = ~ignored[slots]
-        best_scores.append(float(scores[is_candidate][0]) if is_candidate.any() else 0.0)
-        is_right.append(bool(right[slots[is_candidate][0]]) if is_candidate.any() else False)
+            event = walk.step(walks.make_frame(query.path))
+            ranked = walks.list_ranked_names(event, dataset.references)
+            best = next((rank for rank, place in enumerate(ranked) if place not in query.ignored), None)
+            best_scores.append(0.0 if best is None else float(event.ranking.scores[best]))
+            is_right.append(best is not None and ranked[best] in query.correct)
     return np.array(best_scores), np.array(is_right)
 
 
 def measure_gates(
-    name: str, technique: str, answers: list[Answer], scores: list[dict[str, Salience]], kept: dict[str, np.ndarray]
+    name: str,
+    technique: str,
+    score: np.ndarray,
+    is_right: np.ndarray,
+    scores: list[dict[str, Salience]],
+    kept: dict[str, np.ndarray],
 ) -> Iterable[Row]:
     """Yield the rows of a technique on a set: without a gate, with all criteria, and with each alone. The map has all
     references, as in the thesis. `auc` counts a discarded query as a true negative, as the thesis does; `recall_strict`
     counts it as a miss. Of the discarded queries, `true_discarded` were matched rightly without the gate and
     `false_discarded` wrongly. `places` is the share of the references that pass the gate, by the masks `kept`."""
-    score, is_right = score_answers(answers)
     for gate in GATES:
         passes = find_passing(scores, gate)
         precision, recall = metrics.precision_recall(score[passes], is_right[passes])

@@ -17,7 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -150,11 +150,12 @@ class Lap:
         roll_deg = math.degrees(math.atan(SPEED_M_S**2 / RADIUS_M / 9.80665))
         track = []
         for t_s in np.arange(0.0, seconds, 0.5).tolist():
-            pose = self._compute_pose(t_s * turn_rate_rad_s)
-            position = to_position(pose)
-            location = {name: getattr(position, name) for name in ("lat_deg", "lon_deg", "alt_m")}
-            angles = {"heading_deg": pose.heading_deg, "roll_deg": roll_deg, "pitch_deg": 0.0}
-            track.append(TrueState(**location, **angles, height_m=HEIGHT_M, t_s=t_s))
+            angle = t_s * turn_rate_rad_s
+            east_m, north_m = CENTRE_M[0] + RADIUS_M * math.sin(angle), CENTRE_M[1] + RADIUS_M * math.cos(angle)
+            heading_deg = (90 + math.degrees(angle)) % 360
+            pose = CameraPose(east_m=east_m, north_m=north_m, height_m=HEIGHT_M, heading_deg=heading_deg)
+            angles = {"heading_deg": heading_deg, "roll_deg": roll_deg, "pitch_deg": 0.0}
+            track.append(TrueState(**asdict(to_position(pose)), **angles, height_m=HEIGHT_M, t_s=t_s))
         self.controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=GPS_DURATION_S)
         self.truth: list[tuple[float, float, float]] = []
         self.sent: list[tuple[float, float, float, float]] = []
@@ -186,12 +187,6 @@ class Lap:
             self.sent.append(fix)
         return self._receive(message)
 
-    @staticmethod
-    def _compute_pose(angle: float) -> CameraPose:
-        east_m, north_m = CENTRE_M[0] + RADIUS_M * math.sin(angle), CENTRE_M[1] + RADIUS_M * math.cos(angle)
-        heading_deg = (90 + math.degrees(angle)) % 360
-        return CameraPose(east_m=east_m, north_m=north_m, height_m=HEIGHT_M, heading_deg=heading_deg)
-
 
 def fly(seconds: float, folder: Path) -> base.Row:
     """Make the map, fly for `seconds`, and return the results."""
@@ -200,19 +195,17 @@ def fly(seconds: float, folder: Path) -> base.Row:
     list(write_flight(folder, scene, flight))
     fov_deg = math.degrees(2 * math.atan(CAMERA.width / 2 / CAMERA.focal_px))
     lens = ("--camera", "nadir", "--fov-deg", f"{fov_deg:.2f}")
-    program, place_map, log = [sys.executable, "-m", "edgevpr"], folder / "map.gpkg", folder / "flight.jsonl"
-    subprocess.run(
-        [*program, "map", "build", place_map, "--images", folder / "images", *lens, "--no-calibrate"], check=True
-    )
+    place_map, log = folder / "map.gpkg", folder / "flight.jsonl"
+    base.run_edgevpr("map", "build", place_map, "--images", folder / "images", *lens, "--no-calibrate")
     light, rng = flight.light, np.random.default_rng(SEED)
     ground, lap = light_scene(scene, light, SEED), Lap(seconds + 60)
     camera = FaultyCamera(lambda: photograph(ground, scene.metres_per_pixel, lap.record_pose(), CAMERA, light, rng))
     camera.start()
     stop, port = threading.Event(), free_port()
     threading.Thread(target=serve, args=(lap.controller, f"udpin:127.0.0.1:{port}", stop), daemon=True).start()
-    link_flags = ("--link", f"udpout:127.0.0.1:{port}", "--log", log)
+    flags = ("--source", camera.uri, *lens, "--link", f"udpout:127.0.0.1:{port}", "--log", log)
     with open(folder / "errors.txt", "w") as errors:
-        command = [*program, "run", "--map", place_map, "--source", camera.uri, *lens, *link_flags]
+        command = [sys.executable, "-m", "edgevpr", "run", "--map", place_map, *flags]
         run = subprocess.Popen(command, stderr=errors)
     phases, memory_mb, remaining = [], [], []
     fault_rng, end_s = random.Random(SEED), time.monotonic() + seconds

@@ -4,7 +4,6 @@ Both mosaics of a set have the frame of its mosaic_positions.csv, so that map an
 and no picture. Metres are east and north of the middle of a mosaic.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +13,9 @@ import numpy as np
 import rasterio
 from mosaics import Ground, fit_ground, make_mosaic, read_layout, write_tif
 
-from edgevpr.core.geodesy import move_position, offset_m, offset_position
+from edgevpr.core.geodesy import move_position, offset_between_m
 from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.overflight import photograph_ground
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -67,7 +67,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """A map, and the mosaic `query_mosaic` to fly over. `origin`: (lat_deg, lon_deg). `route_m` (N, 2): the places of
+    """A map, and the mosaic `query_mosaic` to fly over, with its middle (`origin`). `route_m` (N, 2): the places of
     the mapped route, over flyable ground; `footprints_m` (N,): the longest sides of their pictures on the ground. Grids
     by the centre of a picture: `max_footprint_m`: its largest footprint with ground in the mosaic; `flyable`: whether
     that is large enough; `covered`: the share of a picture there that the map shows."""
@@ -75,21 +75,13 @@ class Site:
     name: str
     place_map: Path
     query_mosaic: Path
-    origin: tuple[float, float]
+    origin: Position
     footprint_m: float
     route_m: np.ndarray
     footprints_m: np.ndarray
     max_footprint_m: Grid
     flyable: Grid
     covered: Grid
-
-    def to_position(self, point_m: np.ndarray) -> Position:
-        """Return the position of a point (2,) in metres."""
-        return Position(*offset_position(*self.origin, *point_m.tolist()))
-
-    def to_offset_m(self, position: Position) -> np.ndarray:
-        """Return the point (2,), in metres, of a position."""
-        return np.array(offset_m(*self.origin, position.lat_deg, position.lon_deg))
 
 
 def prepare_site(name: str, data: Path, work: Path) -> Site:
@@ -104,7 +96,7 @@ def prepare_site(name: str, data: Path, work: Path) -> Site:
     for part in ("ref", "query"):
         write_tif(folder / f"{part}.tif", ground, *make_mosaic(set_folder, layout, part))
     places = [place for place in sorted(layout.middle) if (set_folder / "ref" / place).is_file()]
-    positions = {place: ground.to_lat_lon(layout.middle[place]) for place in places}
+    positions = {place: ground.to_position(layout.middle[place]) for place in places}
     metre_px = abs(ground.affine.determinant) ** 0.5
     footprints_m = np.array([layout.scale[place] * metre_px * _IMAGE_WIDTH_PX for place in places])
     return _build_site(name, folder, set_folder / "ref", positions, footprints_m)
@@ -139,7 +131,7 @@ def _prepare_rows_site(set_folder: Path, folder: Path) -> Site:
             if image is not None:
                 file = f"{len(positions):04d}.jpg"
                 cv2.imwrite(str(folder / "images" / file), image)
-                positions[file] = position.lat_deg, position.lon_deg
+                positions[file] = position
     photo.close()
     return _build_site(ROWS_SITE, folder, folder / "images", positions, np.full(len(positions), _ROWS_FOOTPRINT_M))
 
@@ -147,17 +139,15 @@ def _prepare_rows_site(set_folder: Path, folder: Path) -> Site:
 def _build_site(name: str, folder: Path, images: Path, positions: dict, footprints_m: np.ndarray) -> Site:
     """Build the map of images at `positions`, and find the ground that can be flown over."""
     place_map, table = folder / "map.gpkg", folder / "positions.csv"
-    with open(table, "w", newline="") as handle:
-        rows = ((file, *position) for file, position in positions.items())
-        csv.writer(handle).writerows([("file", "lat", "lon"), *rows])
+    write_positions(table, {file: GeoTag(position=position) for file, position in positions.items()})
     flags = ("--images", str(images), "--positions", str(table), "--technique", "cohog", "--camera", "nadir")
     base.run_edgevpr("map", "build", place_map, *flags)
     photos = {part: Orthophoto(folder / f"{part}.tif") for part in ("ref", "query")}
-    middle = photos["ref"].middle
-    origin, footprint_m = (middle.lat_deg, middle.lon_deg), float(np.median(footprints_m))
+    origin, footprint_m = photos["ref"].middle, float(np.median(footprints_m))
     south, west, north, east = photos["ref"].extent_deg
-    side_m = 2 * max(np.abs(offset_m(*origin, *corner)).max() for corner in ((south, west), (north, east)))
-    valid = {part: photo.cut(middle, side_m, _GRID_PX)[1] for part, photo in photos.items()}
+    corners = Position(south, west), Position(north, east)
+    side_m = 2 * max(np.abs(offset_between_m(origin, corner)).max() for corner in corners)
+    valid = {part: photo.cut(origin, side_m, _GRID_PX)[1] for part, photo in photos.items()}
     for photo in photos.values():
         photo.close()
     metre_px = side_m / _GRID_PX
@@ -165,7 +155,7 @@ def _build_site(name: str, folder: Path, images: Path, positions: dict, footprin
     for picture_m in _FOOTPRINT_FACTORS * footprint_m:
         max_footprint_m[_measure_share(valid["query"], picture_m / metre_px) >= _MIN_GROUND_SHARE] = picture_m
     flyable = Grid(values=max_footprint_m >= _MIN_FOOTPRINT_FACTOR * footprint_m, metres_per_px=metre_px)
-    places_m = np.array([offset_m(*origin, *position) for position in positions.values()])
+    places_m = np.array([offset_between_m(origin, position) for position in positions.values()])
     route_m, numbers = _find_route(places_m, flyable, footprint_m)
     return Site(
         name=name,

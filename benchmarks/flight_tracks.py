@@ -4,13 +4,13 @@ Metres are east and north of the middle of the site of the map.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import cv2
 import numpy as np
 from flight_sites import Site
 
-from edgevpr.core.geodesy import offset_position
+from edgevpr.core.geodesy import move_position
 from edgevpr.core.types import Vehicle
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.generated import make_oscillation
@@ -193,14 +193,12 @@ def simulate_reports(track: Track, site: Site, fault: str, rng: Rng) -> list[Veh
         if fault == "stops" and number > fault_start:
             reports.append(reports[-1])
             continue
-        lat_deg, lon_deg = offset_position(*site.origin, *position_m[number].tolist())
+        location = asdict(move_position(site.origin, *position_m[number].tolist(), alt_m=100.0))
         velocity = tuple(velocity_m_s[number].tolist())
         if fault == "not a number" and number >= fault_start:
             velocity = (np.nan, np.nan)
         vehicle = Vehicle(
-            lat_deg=lat_deg,
-            lon_deg=lon_deg,
-            alt_m=100.0,
+            **location,
             heading_deg=float(heading_deg[number] % 360),
             t_received_s=t_s - 0.05,
             has_gps=False,
@@ -234,7 +232,6 @@ def take_photographs(
             roll_deg=float(roll[number]),
             pitch_deg=float(pitch[number]),
         )
-        image = photograph_ground(
-            photos[name], sites[name].to_position(track.ground_m[number]), pose, camera, light, rng
-        )
+        position = move_position(sites[name].origin, *track.ground_m[number].tolist())
+        image = photograph_ground(photos[name], position, pose, camera, light, rng)
         yield image if image is None else cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)

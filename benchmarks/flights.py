@@ -41,6 +41,7 @@ from flight_sites import ROWS_SITE, Site
 from where import compute_sigma_shares, summarise
 
 from edgevpr.core.contract import Technique
+from edgevpr.core.geodesy import offset_between_m
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
@@ -165,7 +166,7 @@ def _score_fix(event: Recognition, site: Site, query: Row) -> Row:
     located = event.located
     if located is None:
         return {"fix": None}
-    offset_m = site.to_offset_m(located.position) - (query["east_m"], query["north_m"])
+    offset_m = np.array(offset_between_m(site.origin, located.position)) - (query["east_m"], query["north_m"])
     error_m, side_m, sd_m = float(np.hypot(*offset_m)), site.footprint_m, located.accuracy_m
     is_foreign = query["site_below"] != site.name
     is_wrong = is_foreign or error_m > max(_WRONG_ERROR_SIDES * side_m, _WRONG_ERROR_SIGMAS * sd_m)
@@ -194,11 +195,11 @@ def main() -> None:
         for flight, flight_rows in zip(flights, pool.map(partial(run_flight, sites=sites), flights), strict=True):
             rows += flight_rows
             print(flight, flush=True)
-    result = {**base.describe_run(), "took_s": round(time.monotonic() - begin_s), **summarise_modes(rows, list(MODES))}
+    result = {**base.describe_run(), "took_s": round(time.monotonic() - begin_s), **summarise_modes(rows)}
     base.write("flights", result, format_page(result))
 
 
-def summarise_modes(rows: Sequence[Row], modes: Sequence[str]) -> dict:
+def summarise_modes(rows: Sequence[Row]) -> dict:
     """Return the figures of every mode: of all flights, and by use, site, kind of flight and odometry."""
     groups: dict[str, Callable[[Row], object]] = {
         "all": lambda row: "all",
@@ -209,9 +210,8 @@ def summarise_modes(rows: Sequence[Row], modes: Sequence[str]) -> dict:
     }
     result: dict[str, dict] = {}
     for group, key in groups.items():
-        names = dict.fromkeys(key(row) for row in rows)
-        result[group] = {name: {} for name in names}
-        for name, mode in product(names, modes):
+        result[group] = {key(row): {} for row in rows}
+        for name, mode in product(result[group], MODES):
             mode_rows = [row for row in rows if key(row) == name and row["mode"] == mode]
             result[group][name][mode] = _compute_figures(mode_rows)
     return result
@@ -232,7 +232,6 @@ def _compute_figures(rows: Sequence[Row]) -> dict:
         "right": len(right),
         "wrong": len(fixes) - len(right),
         "far_off": sum(row["is_far"] for row in fixes),
-        "wrong_over_other_ground": sum(row["site_below"] != row["site"] for row in fixes),
         "over_the_map_s": round(sum(over_s)),
         "lost_s": round(sum(lost_s)),
         "longest_gap_s": {"median": round(np.median(gaps_s), 1), "worst": round(max(gaps_s), 1)} if gaps_s else None,

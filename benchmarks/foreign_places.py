@@ -5,12 +5,13 @@ landscapes. A mirrored picture shows ground that exists nowhere, with the same g
 Looking ahead: pictures of other sets, whole, their left and their right 70 %, then all of these mirrored.
 """
 
+import itertools
 import zlib
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import walks
 
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
@@ -34,7 +35,7 @@ _FIRST_SEED = 1000  # of the generated landscapes
 def yield_foreign_places(camera: str, count: int, data: Path, sites: list[Path]) -> Iterator[Frame]:
     """Yield the frames of `count` places in the order of mapping, or of all that exist (looking ahead)."""
     frames = _yield_nadir_places(sites) if camera == "nadir" else _yield_forward_places(data)
-    return islice(frames, count)
+    return itertools.islice(frames, count)
 
 
 def _yield_nadir_places(sites: list[Path]) -> Iterator[Frame]:
@@ -45,11 +46,10 @@ def _yield_nadir_places(sites: list[Path]) -> Iterator[Frame]:
                 rng = np.random.default_rng(zlib.crc32(f"{site.name}/{path.name}".encode()))
                 for number in range(_CROPS_PER_IMAGE):
                     name = f"{MIRRORED_PREFIX}/{site.name}/{path.name}/{number}"
-                    yield _make_frame(_crop_image(mirrored, *rng.uniform((0.5, 0, 0), (1, 1, 1))), name)
-    seed = _FIRST_SEED
-    while True:
+                    crop = _crop_image(mirrored, *rng.uniform((0.5, 0, 0), (1, 1, 1)))
+                    yield walks.make_frame(np.ascontiguousarray(crop), name)
+    for seed in itertools.count(_FIRST_SEED):
         yield from _yield_landscape(seed)
-        seed += 1
 
 
 def _crop_image(image: np.ndarray, share: float, down: float, right: float) -> np.ndarray:
@@ -76,7 +76,7 @@ def _yield_landscape(seed: int) -> Iterator[Frame]:
             height_m, heading_deg = rng.uniform((50, 0), (80, 360))
             pose = CameraPose(east_m=east_m, north_m=north_m, height_m=height_m, heading_deg=heading_deg)
             image = photograph(ground, scene.metres_per_pixel, pose, Camera(), light, rng)
-            yield _make_frame(image, f"{GENERATED_PREFIX}/{seed}/{north_m:.0f}/{east_m:.0f}")
+            yield walks.make_frame(image, f"{GENERATED_PREFIX}/{seed}/{north_m:.0f}/{east_m:.0f}")
 
 
 def _yield_forward_places(data: Path) -> Iterator[Frame]:
@@ -89,8 +89,5 @@ def _yield_forward_places(data: Path) -> Iterator[Frame]:
                     width = image.shape[1]
                     image = image[:, round(start * width) : round(end * width)][:, :: -1 if is_mirrored else 1]
                     change = f"{'mirrored ' if is_mirrored else ''}{cut}"
-                    yield _make_frame(image, f"{OTHER_SET_PREFIX}/{change}/{folder}/{path.name}")
-
-
-def _make_frame(image: np.ndarray, name: str) -> Frame:
-    return Frame(image=np.ascontiguousarray(image), name=name, t_mono_s=0.0)
+                    name = f"{OTHER_SET_PREFIX}/{change}/{folder}/{path.name}"
+                    yield walks.make_frame(np.ascontiguousarray(image), name)

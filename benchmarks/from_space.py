@@ -98,15 +98,13 @@ def render_flight(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0)
     south, west, north, east = photo.extent_deg
     high_m, wide_m = (float(distance_m(south, west, *corner)) for corner in ((north, west), (south, east)))
     inside_m = 0.75 * FOOTPRINT_M
-    tags = []
+    tags, attitude = [], {"roll_deg": 0.0, "pitch_deg": tilt_deg} if tilt_deg else {}
     for row in np.linspace(inside_m, high_m - inside_m, _GRID[1]):
         for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0])[:: -1 if len(tags) // _GRID[0] % 2 else 1]:
             heading_deg = float(rng.uniform(0, 360))
             back_m = -ahead_m * np.array([np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))])
             camera_position = Position(*offset_position(south, west, column + back_m[0], row + back_m[1]))
-            tags.append(GeoTag(position=camera_position, height_m=height_m, heading_deg=heading_deg))
-            if tilt_deg:
-                tags[-1] = replace(tags[-1], roll_deg=0.0, pitch_deg=tilt_deg)
+            tags.append(GeoTag(position=camera_position, height_m=height_m, heading_deg=heading_deg, **attitude))
     for number, (tag, pose) in enumerate(zip(tags, make_poses(tags, _SEED), strict=True)):
         image = photograph_ground(photo, tag.position, pose, camera, _LIGHT, rng)
         if image is None and tilt_deg:

@@ -10,6 +10,8 @@ import numpy as np
 import rasterio
 from rasterio.warp import transform
 
+from edgevpr.core.geodesy import fit_similarity
+from edgevpr.core.types import Position
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
 
@@ -55,11 +57,11 @@ class Ground:
     crs: str
     affine: rasterio.Affine
 
-    def to_lat_lon(self, pixel: np.ndarray) -> tuple[float, float]:
-        """Return the position (lat_deg, lon_deg) of a point (2,) of the canvas."""
+    def to_position(self, pixel: np.ndarray) -> Position:
+        """Return the position of a point (2,) of the canvas."""
         east, north = self.affine @ tuple(pixel + 0.5)
         (lon,), (lat,) = transform(self.crs, "EPSG:4326", [east], [north])
-        return lat, lon
+        return Position(lat, lon)
 
 
 def make_mosaic(folder: Path, layout: MosaicLayout, part: str) -> tuple[np.ndarray, np.ndarray]:
@@ -83,14 +85,19 @@ def make_mosaic(folder: Path, layout: MosaicLayout, part: str) -> tuple[np.ndarr
 
 
 def fit_ground(folder: Path, layout: MosaicLayout) -> Ground:
-    """Fit the georeference of a mosaic to the GPS tags of its pictures."""
+    """Fit the georeference of a mosaic to the GPS tags of its pictures, without outliers."""
     tags = {name: tag.position for name, tag in read_positions(folder / "positions.csv").items() if tag.position}
     tagged = [name for name in layout.middle if name in tags]
     lat_deg, lon_deg = ([getattr(tags[name], key) for name in tagged] for key in ("lat_deg", "lon_deg"))
     crs = f"EPSG:{32600 + int((np.mean(lon_deg) + 180) // 6) + 1}"  # UTM zone, northern hemisphere
     east_m, north_m = transform("EPSG:4326", crs, lon_deg, lat_deg)
     pixels = np.array([complex(*layout.middle[name] * (1, -1)) for name in tagged])
-    scale, offset = _fit_similarity(pixels, np.array(east_m) + 1j * np.array(north_m))
+    metres = np.array(east_m) + 1j * np.array(north_m)
+    is_inlier = np.ones(len(pixels), bool)
+    for _ in range(_FIT_ROUNDS):
+        scale, offset = fit_similarity(pixels[is_inlier], metres[is_inlier])
+        residual_m = abs(scale * pixels + offset - metres)
+        is_inlier = residual_m < 2.5 * np.median(residual_m)
     return Ground(crs, rasterio.Affine(scale.real, scale.imag, offset.real, scale.imag, -scale.real, offset.imag))
 
 
@@ -103,13 +110,3 @@ def write_tif(path: Path, ground: Ground, canvas: np.ndarray, covered: np.ndarra
         path, "w", transform=ground.affine, tiled=True, compress="deflate", photometric="RGB", alpha="yes", **layout
     ) as out:
         out.write(bands)
-
-
-def _fit_similarity(pixels: np.ndarray, metres: np.ndarray) -> tuple[complex, complex]:
-    """Fit metres = scale * pixels + offset (complex, (N,) each), without outliers."""
-    is_inlier = np.ones(len(pixels), bool)
-    for _ in range(_FIT_ROUNDS):
-        (scale, offset), *_ = np.linalg.lstsq(np.stack([pixels, np.ones(len(pixels))], 1)[is_inlier], metres[is_inlier])
-        residual_m = abs(scale * pixels + offset - metres)
-        is_inlier = residual_m < 2.5 * np.median(residual_m)
-    return complex(scale), complex(offset)

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 import rasterio
 
-from edgevpr.core.geodesy import offset_position
-from edgevpr.core.types import Position
+from edgevpr.core.geodesy import move_position
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.generated import ORIGIN, to_position
 from edgevpr.lab.simulate.landscape import make_scene
@@ -121,9 +120,8 @@ def move_map(place_map: Path, east_m: float, up_m: float) -> Path:
         shutil.copy(place_map, unfinished)
         with PlaceMap.open_for_writing(unfinished) as places, places.transaction():
             for place in list(places.read_places()):
-                position = place.position
-                lat_deg, lon_deg = offset_position(position.lat_deg, position.lon_deg, east_m, 0.0)
-                places.move_place(place.place_id, Position(lat_deg, lon_deg, position.alt_m + up_m), place.pose)
+                position = move_position(place.position, east_m, 0.0, place.position.alt_m + up_m)
+                places.move_place(place.place_id, position, place.pose)
         unfinished.rename(path)
     return path
 

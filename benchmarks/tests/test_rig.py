@@ -8,17 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from edgevpr.lab.simulate.camera import CameraPose
-from edgevpr.lab.simulate.generated import ORIGIN, to_metres, to_position
+from edgevpr.lab.simulate.generated import ORIGIN, to_metres
 
 sys.path.append(str(Path(__file__).parents[1] / "rig"))
 import figures
 import truth
-
-
-def to_degrees(east_m: float, north_m: float) -> tuple[float, float]:
-    position = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
-    return position.lat_deg, position.lon_deg
+from simulator import to_degrees
 
 
 def test_compute_pose_extrapolates_a_turn_after_two_states():
