@@ -22,12 +22,21 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Ints
 from edgevpr.runtime.recognise.gaussians import (
-    MIN_VARIANCE_RATIO,
     compute_distances,
     compute_mean_sd,
     fuse_positions,
     mix_gaussians,
     regularize_covariance,
+)
+from edgevpr.runtime.recognise.hypotheses import (
+    MIN_DIVISOR,
+    Hypotheses,
+    MapScale,
+    Motion,
+    Prediction,
+    compute_density,
+    predict_misses,
+    predict_motions,
 )
 
 _MAX_HYPOTHESES = 64
@@ -39,84 +48,11 @@ _ENTER_CHANCE = 0.02
 _MISS_LIKELIHOOD = 0.2  # of a query that misses the place below the aircraft, relative to a query off the map
 _RESEMBLANCE = 0.1  # probability that ground outside the map, once mistaken for a place, also resembles the next ones
 _MIN_NONE_PROBABILITY = 1e-4  # lowest probability that no candidate is correct
-_CV_PROBABILITY = 0.75  # of motion at constant velocity
-_CV_SD = 0.5  # of this motion, in spacings of the map, and as a fraction of the displacement
-# Odometry of the autopilot and of the camera: the probability that it is correct, and its standard deviation in
-# spacings and as a fraction of the displacement.
-_REPORTED_ODOMETRY = (0.6, 0.25, 0.15)
-_VISUAL_ODOMETRY = (0.98, 0.05, 0.05)
-_REACH_SIGMAS = 1.5  # the reach, in standard deviations of the motion
 _NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
 _SAME_POSITION_SIGMAS = 2.0  # of a position: a shorter displacement may be zero
 _MIN_WEIGHT = 1e-9  # a hypothesis with less weight is dropped
-_MIN_DIVISOR = 1e-300  # replaces zero
 _MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
 _MIN_SD = 0.25  # smallest standard deviation of a position, in spacings of the map
-_UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with density 1 at its mean: second axis of ordinal maps
-DEFAULT_MAX_SPEED_M_S = 30.0  # unless the configuration sets another speed
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Motion:
-    """Motion of the aircraft since the previous query, in metres or places: `reach` is the farthest it can have moved
-    in `elapsed_s` seconds, and `displacement` (2,) the motion measured by the odometry of the camera (`is_visual`) or
-    of the autopilot (None: unknown)."""
-
-    reach: float
-    elapsed_s: float
-    displacement: Doubles | None = None
-    is_visual: bool = False
-
-    def new_ground_fraction(self, spacing: float) -> float:
-        """Return the fraction (0..1) of the ground in the picture that is new; 1 without visual odometry."""
-        step = self.displacement
-        return min(1.0, float(np.hypot(*step)) / spacing) if self.is_visual and step is not None else 1.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Hypotheses:
-    """M possible positions of the aircraft: `weight` (M,), `position` (M, 2) with its `covariance` (M, 2, 2),
-    `velocity` (M, 2) in map units per second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
-    unknown). `credited` (M,): logarithm of the likelihood ratio already counted around `anchor` (M, 2). `confirmed`
-    (M,): the fraction (0..1) of the weight that descends from a match that was certain by itself."""
-
-    weight: Doubles
-    position: Doubles
-    covariance: Doubles
-    velocity: Doubles
-    heading: Doubles
-    credited: Doubles
-    anchor: Doubles
-    confirmed: Doubles
-
-    def __getitem__(self, index: Ints) -> "_Hypotheses":
-        return _Hypotheses(**{name: getattr(self, name)[index] for name in self.__slots__})
-
-
-@dataclass(frozen=True, slots=True)
-class _Prediction:
-    """One possible motion of each of M hypotheses: its `probability` (M,), and the new `position` (M, 2) with its
-    `covariance` (M, 2, 2). The density is at least `min_density` everywhere."""
-
-    probability: Doubles
-    position: Doubles
-    covariance: Doubles
-    min_density: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MapScale:
-    """Characteristic distances of a map. `spacing` is the distance after which a picture is new evidence: about half a
-    footprint, or 1 in an ordinal map (`is_ordinal`). Hypotheses within `near` of each other count as one position."""
-
-    spacing: float
-    near: float
-    is_ordinal: bool = False
-
-    @property
-    def cell(self) -> float:
-        """Extent of one place: an area, or a length in an ordinal map."""
-        return self.spacing if self.is_ordinal else self.spacing**2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,7 +93,7 @@ class Belief:
         self._strongest, self._lost, self._enter_chance = 0.0, 1.0, 0.5  # as in the prior of the proposals
         shapes = {"weight": 0, "position": (0, 2), "covariance": (0, 2, 2), "velocity": (0, 2), "heading": (0, 2)}
         shapes |= {"credited": 0, "anchor": (0, 2), "confirmed": 0}
-        self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
+        self._now = Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
     def drop_off_map(self, places: Doubles, sight: float) -> None:
         """Drop each hypothesis that is farther than `sight`, plus its standard deviation, from all `places` (N, 2):
@@ -174,28 +110,28 @@ class Belief:
         that are not finite are ignored), the motion since the previous query, and the number of places in the map."""
         odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)  # of not being lost
         now, lost, arrival = self._apply_transitions()
-        moves = self._predict_motions(now, motion, places)
+        moves = predict_motions(now, motion, places, self._scale)
         probability = np.zeros(0 if proposed is None else len(proposed.probability))
         predicted = np.zeros_like(probability)
         indices: Ints = np.zeros(0, int)
         if proposed is None:
             lost += arrival  # an aircraft that enters the map now is at an unknown place
-            updated = _predict_misses(now, moves, 1.0)
+            updated = predict_misses(now, moves, 1.0)
         else:
             self._enter_chance = _ENTER_CHANCE
             indices, proposed = _select_usable(proposed, self._scale)
             hits, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, arrival, places)
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
-            misses = _predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
+            misses = predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
             predicted[indices] = self._compute_mass_near(
                 replace(misses, weight=now.weight * now.confirmed), proposed.position
             )
             # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
             min_gain = (factor * odds * lost - float(misses.weight.sum())) / max(float(hits.weight.sum()), _MIN_WEIGHT)
             hits = replace(hits, weight=hits.weight * max(1.0, min_gain) ** staleness)
-            pairs = {name: (getattr(hits, name), getattr(misses, name)) for name in _Hypotheses.__slots__}
-            updated = _Hypotheses(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+            pairs = {name: (getattr(hits, name), getattr(misses, name)) for name in Hypotheses.__slots__}
+            updated = Hypotheses(**{name: np.concatenate(pair) for name, pair in pairs.items()})
         weight = updated.weight / (lost + float(updated.weight.sum()))
         probability[indices] = weight[: len(indices)]
         strongest = np.argsort(-weight, kind="stable")[:_MAX_HYPOTHESES]
@@ -203,58 +139,32 @@ class Belief:
         self._lost = max(0.0, 1 - float(self._now.weight.sum()))
         return self._make_posterior(probability, predicted)
 
-    def _compute_mass_near(self, moved: _Hypotheses, position: Doubles) -> Doubles:
+    def _compute_mass_near(self, moved: Hypotheses, position: Doubles) -> Doubles:
         """Return the weight (K,) of the hypotheses near each `position` (K, 2), allowing for their covariance."""
         near = self._scale.near + _SAME_POSITION_SIGMAS * compute_mean_sd(moved.covariance)
         return np.asarray((compute_distances(position, moved.position) <= near) @ moved.weight)
 
-    def _apply_transitions(self) -> tuple[_Hypotheses, float, float]:
+    def _apply_transitions(self) -> tuple[Hypotheses, float, float]:
         """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the
         probability of being lost, and that of having entered or jumped to any place."""
         on_map = float(self._now.weight.sum())
         lost = (1 - self._enter_chance) * self._lost + _LEAVE_CHANCE * on_map
         stay_chance = 1 - _LEAVE_CHANCE - _JUMP_CHANCE
-        leak = max(0.0, math.log(max(lost, _MIN_DIVISOR) / max(stay_chance * self._lost, _MIN_DIVISOR)))
+        leak = max(0.0, math.log(max(lost, MIN_DIVISOR) / max(stay_chance * self._lost, MIN_DIVISOR)))
         self._strongest = max(0.0, self._strongest - leak)
         credited = np.maximum(self._now.credited - leak, 0)
         now = replace(self._now, weight=stay_chance * self._now.weight, credited=credited)
         return now, lost, self._enter_chance * self._lost + _JUMP_CHANCE * on_map
 
-    def _predict_motions(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Prediction]:
-        """Return the possible motions of each hypothesis: from odometry, at constant velocity, or anywhere in reach."""
-        scale, moves = self._scale, []
-        area = places * scale.cell
-        widest = area / 2 if scale.is_ordinal else math.sqrt(area / math.pi)
-        is_everywhere = not motion.reach < widest
-        reach = widest if is_everywhere else motion.reach
-        has_velocity = ~np.isnan(now.velocity[:, 0])
-        step = np.where(has_velocity[:, None], now.velocity, 0) * motion.elapsed_s
-        step *= (motion.reach / np.maximum(np.hypot(*step.T), max(motion.reach, _MIN_DIVISOR)))[:, None]
-        remaining, mean_move = np.ones(len(now.weight)), np.zeros(2)
-        sd = max(reach / _REACH_SIGMAS, _CV_SD * scale.spacing)
-        if (displacement := motion.displacement) is not None:
-            probability, min_sd, relative_sd = _VISUAL_ODOMETRY if motion.is_visual else _REPORTED_ODOMETRY
-            spread = (relative_sd**2 * displacement @ displacement + (min_sd * scale.spacing) ** 2) * np.eye(2)
-            moves.append(_Prediction(probability * remaining, now.position + displacement, now.covariance + spread))
-            # Odometry wrong by a factor of two has an error as large as the displacement itself.
-            remaining, mean_move = (1 - probability) * remaining, displacement
-            sd = min(sd, scale.spacing + math.hypot(*displacement))
-        variance = (_CV_SD * scale.spacing) ** 2 + (_CV_SD * np.hypot(*step.T)) ** 2 / 2
-        cv_covariance = now.covariance + variance[:, None, None] * np.eye(2)
-        moves.append(_Prediction(_CV_PROBABILITY * has_velocity * remaining, now.position + step, cv_covariance))
-        remaining, anywhere = (1 - _CV_PROBABILITY * has_velocity) * remaining, now.covariance + sd**2 * np.eye(2)
-        moves.append(_Prediction(remaining, now.position + mean_move, anywhere, is_everywhere / area))
-        return moves
-
     def _weigh(
         self,
         proposed: Proposals,
-        now: _Hypotheses,
-        moves: list[_Prediction],
+        now: Hypotheses,
+        moves: list[Prediction],
         elapsed_s: float,
         arrival: float,
         places: int,
-    ) -> tuple[_Hypotheses, float, float, float]:
+    ) -> tuple[Hypotheses, float, float, float]:
         """Weight the candidates by the hypotheses that can have moved to them. Returns
 
         * one hypothesis for each candidate,
@@ -264,7 +174,7 @@ class Belief:
         """
         scale, position, cov = self._scale, proposed.position, proposed.covariance
         p_none = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.probability.sum()))
-        ratio = np.log(np.maximum(proposed.probability, _MIN_DIVISOR) * places / p_none)
+        ratio = np.log(np.maximum(proposed.probability, MIN_DIVISOR) * places / p_none)
         arrival_weight = arrival / places * np.exp(ratio)
 
         # A picture of the same ground repeats the previous evidence. This holds for a lost aircraft as well.
@@ -275,22 +185,22 @@ class Belief:
         evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.weight[:, None])
         # For each motion, the weight (M, K) that each hypothesis gives each candidate.
         weights = [
-            move.probability[:, None] * evidence * _compute_density(move, position, cov, scale.is_ordinal)
+            move.probability[:, None] * evidence * compute_density(move, position, cov, scale.is_ordinal)
             for move in moves
         ]
         weight = sum(matrix.sum(0) for matrix in weights)
         total = weight + arrival_weight
-        origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): fraction of a candidate's weight
+        origin = sum(weights) / np.maximum(weight, MIN_DIVISOR)  # (M, K): fraction of a candidate's weight
         stale = origin * (1 - fresh)
-        staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float(total.sum()))
+        staleness = float(weight @ stale.sum(0)) / max(MIN_DIVISOR, float(total.sum()))
         newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
         odds_factor = math.exp(min(0.0, newest - before))
         expected = float(now.weight.sum() * proposed.probability.sum())
-        agreement = float(weight.sum()) * p_none / max(_MIN_DIVISOR, expected)
+        agreement = float(weight.sum()) * p_none / max(MIN_DIVISOR, expected)
         likelihood = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.weight) else 1.0
 
         predicted_position, predicted_cov = mix_gaussians(
-            np.concatenate(weights).T / np.maximum(weight, _MIN_DIVISOR)[:, None],
+            np.concatenate(weights).T / np.maximum(weight, MIN_DIVISOR)[:, None],
             np.concatenate([move.position for move in moves]),
             np.concatenate([move.covariance for move in moves]),
         )
@@ -300,7 +210,7 @@ class Belief:
         velocity = (origin.T @ gain) * position / elapsed_s + origin.T @ kept
         anchor = (1 - stale.sum(0))[:, None] * position + stale.T @ now.anchor
         is_continued, heading = (weight > arrival_weight)[:, None], np.radians(proposed.heading_deg)
-        hypotheses = _Hypotheses(
+        hypotheses = Hypotheses(
             weight=math.exp(-staleness * repeated) * total,
             position=np.where(is_continued, fused_position, position),
             covariance=np.where(is_continued[..., None], fused_cov, cov),
@@ -309,7 +219,7 @@ class Belief:
             credited=np.maximum(ratio, 0),
             anchor=np.where(is_continued, anchor, position),
             confirmed=np.where(
-                proposed.is_certain, 1.0, (origin.T @ now.confirmed) * weight / np.maximum(total, _MIN_DIVISOR)
+                proposed.is_certain, 1.0, (origin.T @ now.confirmed) * weight / np.maximum(total, MIN_DIVISOR)
             ),
         )
         return hypotheses, likelihood, staleness, odds_factor
@@ -328,29 +238,6 @@ class Belief:
         north, east = (weight @ now.heading[chosen]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
         return replace(posterior, mass=mass, position=position, covariance=covariance, heading_deg=heading_deg)
-
-
-def _predict_misses(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:
-    """Return the moved hypotheses if the query proposes none of them, with the weight multiplied by this likelihood."""
-    probability = np.stack([move.probability for move in moves], 1)[..., None]
-    position = np.stack([move.position for move in moves], 1)
-    covariance = np.stack([move.covariance for move in moves], 1)
-    mean = (probability * position).sum(1)
-    offsets = position - mean[:, None]
-    spread = (probability[..., None] * (covariance + offsets[..., :, None] * offsets[..., None, :])).sum(1)
-    return replace(now, weight=likelihood * now.weight, position=mean, covariance=spread)
-
-
-def _compute_density(move: _Prediction, position: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
-    """Return the density (M, K) at K positions (K, 2) with `covariance` (K, 2, 2), after M hypotheses have moved."""
-    xx, xy, yy = (move.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    dx, dy = (position[None, :, i] - move.position[:, None, i] for i in (0, 1))
-    if is_ordinal:
-        xy, yy, dy = np.zeros(()), np.full((), _UNIT_VARIANCE), np.zeros(())
-    determinant = np.maximum(xx * yy - xy * xy, MIN_VARIANCE_RATIO * xx * yy)
-    squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
-    gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
-    return np.maximum(gaussian, move.min_density)
 
 
 def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:

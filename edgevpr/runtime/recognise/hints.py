@@ -21,7 +21,7 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.retrieve import Expectation
-from edgevpr.runtime.recognise.belief import DEFAULT_MAX_SPEED_M_S
+from edgevpr.runtime.recognise.hypotheses import DEFAULT_MAX_SPEED_M_S
 from edgevpr.runtime.recognise.locate import Located
 
 KNOWN_FIELDS = ("heading", "height", "reach")  # data that a recorded query may have

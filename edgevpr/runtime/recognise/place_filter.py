@@ -18,8 +18,9 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import Ranking
-from edgevpr.runtime.recognise.belief import DEFAULT_MAX_SPEED_M_S, Belief, MapScale, Motion, Proposals
+from edgevpr.runtime.recognise.belief import Belief, Proposals
 from edgevpr.runtime.recognise.evidence import Evidence, compute_share
+from edgevpr.runtime.recognise.hypotheses import DEFAULT_MAX_SPEED_M_S, MapScale, Motion
 from edgevpr.runtime.recognise.judge import ConfidenceRule
 from edgevpr.runtime.recognise.locate import Located, covariance_matrix, to_triple
 from edgevpr.runtime.recognise.odometry import OdometryStep

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
+from edgevpr.runtime.recognise.belief import Belief, Proposals
+from edgevpr.runtime.recognise.hypotheses import MapScale
 from edgevpr.runtime.recognise.place_filter import make_motion
 
 PLACES = 100
