@@ -34,11 +34,11 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
 _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long after the last match, odometry or GPS
-# From accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends this
-# long after the last picture with a match or odometry or, until there is one, this long after GPS: sent for half a
-# minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (without our positions: 25 m).
-_MAX_BLIND_S = 10.0
-_PX4_MAX_BLIND_S = 5.0  # PX4 then dead-reckons for another 5 s: 10 s of tilted accelerations led it 70 m away
+# From accelerations alone we know no more than the autopilot, which has them too, and dead-reckons for some seconds
+# itself. So a continuous position ends this long after the last picture with a match or odometry or, until there is
+# one, this long after GPS. Positions sent for ten seconds led an ArduPilot copter whose camera froze 31 m away, and a
+# PX4 copter 70 m.
+_MAX_BLIND_S = 5.0
 _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
@@ -287,8 +287,7 @@ class Navigator(Listener):
         if self._channel.is_continuous:
             # A channel used with GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
             is_gps_recent = self._channel.works_with_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
-            max_blind_s = _PX4_MAX_BLIND_S if self._channel in _PX4_CHANNELS else _MAX_BLIND_S
-            is_known = t_s - last_vision_s <= max_blind_s or is_gps_recent
+            is_known = t_s - last_vision_s <= _MAX_BLIND_S or is_gps_recent
         else:
             is_known = t_s - max(last_vision_s, last_gps_s) <= _MAX_INTERIM_S
         return estimate if is_known else None
