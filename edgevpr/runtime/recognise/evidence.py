@@ -107,15 +107,16 @@ class Evidence:
     def needs_landmarks(self) -> bool:
         """True if neither the regions nor the landmarks prove a match (ahead):
 
-        * It may have a twin, because the look-alikes of the map are unknown, and the lead is not large.
+        * It may have a twin, because the look-alikes of the map are unknown, and its lead is not large: twice as many
+          landmarks must agree.
         * The place has a small lead: ground outside the map may look like the map.
         * It has a small lead, and the regions of another place rank better: twice as many landmarks must agree.
         * It is a single view (see `LookAlikes`), and the query agrees with it hardly better than the most similar
           place does: from another spot, each of the two may look more like the other."""
         if self.likeness is None:
             return False
-        if self.twin is None and self.lead < _MIN_LEAD_OVER_TWIN and not self.proof:
-            return True
+        if self.twin is None and self.lead < _MIN_LEAD_OVER_TWIN:
+            return (self.proof or 0.0) < _MIN_PROOF
         if self.has_small_lead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
             return (self.proof or 0.0) < _MIN_PROOF
         if self.apart is not None:

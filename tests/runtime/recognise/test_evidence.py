@@ -97,7 +97,8 @@ SMALL_LEAD = replace(CLEAR_LEAD, lead=math.log(1.49))
     [
         (CLEAR_LEAD, False),
         (replace(CLEAR_LEAD, twin=None), True),
-        (replace(CLEAR_LEAD, twin=None, proof=log_inlier_ratio(9, 3)), False),
+        (replace(CLEAR_LEAD, twin=None, proof=log_inlier_ratio(15, 3)), True),
+        (replace(CLEAR_LEAD, twin=None, proof=log_inlier_ratio(16, 3)), False),
         (replace(CLEAR_LEAD, twin=None, lead=math.log(3.99)), True),
         (replace(CLEAR_LEAD, twin=None, lead=math.log(4.01)), False),
         (SMALL_LEAD, True),
