@@ -80,7 +80,8 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
             values[key] = value_type(value)
         except ValueError:
             raise UsageError(f"{name}: `{key}` is {value!r}, but must be {_TYPE_NAMES[value_type]}.") from None
-    return _find_factory(name)(**values)
+    technique: Technique = _find_factory(name)(**values)
+    return technique
 
 
 def _find_factory(name: str) -> Callable[..., Any]:

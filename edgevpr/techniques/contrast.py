@@ -54,7 +54,8 @@ def stretch_contrast(
     picture -= np.float32(low)
     picture *= np.float32(gain)
     picture += np.float32(min(low, 255 - target_levels))
-    return np.clip(picture, 0, 255, out=picture)
+    clipped: Singles = np.clip(picture, 0, 255, out=picture)
+    return clipped
 
 
 def _find_range(grey: Singles, allowed: Mask | None) -> tuple[float, float]:

@@ -73,7 +73,8 @@ def make_field(grid: Grid, patterns: Array, indices: Ints, sides: tuple[int, int
     surround = _make_distance_weights(len(weight), _SURROUND_SD * grid.side)
     values -= weight * _apply_weights(surround, values) / np.maximum(_apply_weights(surround, weight), _TINY)
     values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _MIN_STRENGTH))
-    return values * (weight > _MIN_SEEN_FRACTION)
+    field: Array = values * (weight > _MIN_SEEN_FRACTION)
+    return field
 
 
 def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
@@ -88,7 +89,8 @@ def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
             _MAX_LEVEL + 1
         )
         stored.append(levels[::2] | levels[1::2] << 4)
-    return np.concatenate(stored).astype(np.uint8)
+    packed: Bytes = np.concatenate(stored).astype(np.uint8)
+    return packed
 
 
 def scan_places(fields: Fields, rows: Bytes, rotation_deg: Doubles | None, likely: Bools | None) -> Singles:
@@ -207,16 +209,19 @@ def _make_pooling(side: int, place_side: int, cells: int) -> Singles:
     starts = (np.arange(m)[:, None] - m / 2) * pitch
     region = np.arange(side) - side / 2
     overlap = np.minimum(starts + pitch, region + 1) - np.maximum(starts, region)
-    return (overlap.clip(0) / pitch).astype(np.float32)
+    weights: Singles = (overlap.clip(0) / pitch).astype(np.float32)
+    return weights
 
 
 @lru_cache
 def _make_distance_weights(cells: int, sd: float) -> Singles:
     """Return Gaussian weights of the distances between the cells of a row, float32 (cells, cells)."""
     distance = np.subtract.outer(np.arange(cells), np.arange(cells))
-    return np.exp(-(distance**2) / (2 * sd**2)).astype(np.float32)
+    weights: Singles = np.exp(-(distance**2) / (2 * sd**2)).astype(np.float32)
+    return weights
 
 
 def _apply_weights(weights: Singles, values: Array) -> Array:
     """Apply `weights` (m, n) along both sides of `values` (..., n, n): (..., m, m)."""
-    return weights @ values @ weights.T
+    summed: Array = weights @ values @ weights.T
+    return summed

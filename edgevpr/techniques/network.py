@@ -141,7 +141,8 @@ def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -
 
     def head(features: Singles) -> Singles:
         pooled = pool_pyramid(features, levels)
-        return pooled / max(float(np.abs(pooled).sum()), 1e-6)
+        normalised: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
+        return normalised
 
     backbone, parameters = open_backbone(model, "features", threads), {"model": model, "levels": levels}
     return NetworkVector(name, backbone, head, parameters=parameters, form=form, similarity="l1")

@@ -173,7 +173,8 @@ def describe_regions(features: Singles, boxes: Ints) -> Singles:
     np.cumsum(sums, axis=1, out=sums)
     top, left, bottom, right = boxes.T
     box_sums = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    return normalise_rows(box_sums).astype(np.float32)
+    regions: Singles = normalise_rows(box_sums).astype(np.float32)
+    return regions
 
 
 def score_mutual_pairs(query: Singles, place: Singles) -> float:
@@ -193,9 +194,11 @@ def score_mutual_pairs(query: Singles, place: Singles) -> float:
 def to_bytes(vectors: Singles) -> Array:
     """Quantise directions to 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest magnitude."""
     largest = np.maximum(np.abs(vectors).max(axis=1, keepdims=True), _TINY)
-    return np.rint(127 / largest * vectors).astype(np.int8)
+    stored: Array = np.rint(127 / largest * vectors).astype(np.int8)
+    return stored
 
 
 def from_bytes(stored: Array) -> Singles:
     """Restore the rows of `to_bytes`, L2-normalised: int8 (N, D) to float32 (N, D); a zero row stays zero."""
-    return normalise_rows(stored.astype(np.float32))
+    vectors: Singles = normalise_rows(stored.astype(np.float32))
+    return vectors
