@@ -59,7 +59,8 @@ def run_report(args: Namespace) -> None:
 
 def run_replay(args: Namespace) -> int:
     """Run `replay`: replay a recorded flight, and print the comparison. The exit code is 1 if anything differs."""
-    from edgevpr.review.replay import compare_lines, replay
+    from edgevpr.review.compare import compare_lines
+    from edgevpr.review.replay import replay
 
     result = replay(args.log, args.map)
     end = {"guessed": result.guessed, "why_ended": result.why_ended}

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refinement
     from edgevpr.places.examine import MapCheck
     from edgevpr.places.mapinfo import MapInfo
-    from edgevpr.review.replay import LineComparison, ReplayResult
-    from edgevpr.review.tape import PacketComparison
+    from edgevpr.review.compare import LineComparison, PacketComparison
+    from edgevpr.review.replay import ReplayResult
 
 NO_POSITIONS_NOTE = (
     "no place has a position, so flights with this map send no fixes and only report which place was recognised. Give "

@@ -1,10 +1,8 @@
-"""Replays a recorded flight, for `edgevpr replay`: runs its code with clocks, frames and messages of the recording, and
-compares both logs line by line."""
+"""Replays a recorded flight, for `edgevpr replay`: runs its code with clocks, frames and messages of the recording."""
 
 import logging
-from collections.abc import Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +17,7 @@ from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
 from edgevpr.power.thermal import ThermalWatch
 from edgevpr.review import tape
+from edgevpr.review.compare import Line, PacketComparison
 from edgevpr.runtime.flight.boundary import TapedStop, TapedTurns, tape_clock, tape_machine
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import Flight
@@ -26,12 +25,6 @@ from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.recording import TAPE, frame_path, read_recorded
-
-Line = dict[str, Any]
-Changes = dict[str, tuple[Any, Any]]  # by name: (value in the flight, value in the replay)
-
-# Fields of a log's first line that describe the program, not the flight.
-_PROGRAM_FIELDS = ("version", "machine", "python", "libraries")
 
 _log = logging.getLogger(__name__)
 
@@ -44,7 +37,7 @@ class ReplayResult:
 
     flown: list[Line]
     lines: list[Line]
-    packets: tape.PacketComparison
+    packets: PacketComparison
     why_ended: str | None
     guessed: int
 
@@ -129,44 +122,3 @@ def _drop_unknown_settings(recorded: dict[str, Any], kind: type, prefix: str = "
         elif value not in (None, False):
             _log.warning("the flight had the setting `%s`, which this version of edgevpr does not recognise", key_name)
     return settings
-
-
-@dataclass(slots=True)
-class LineComparison:
-    """Comparison of the logs of a flight and its replay. `alike`: number of equal lines. `others`: the lines that
-    differ. `after`: number of lines of the flight after the end of the replay. `program`: differing fields of the first
-    line that describe the program. Each of the `others` has the `kind` of the line, its time `t_mono_s`, its `query`,
-    and either `fields`, the differing fields by dotted name (such as "fix.sent"), or `only_in`: "replay" if the flight
-    has no such line."""
-
-    alike: int = 0
-    others: list[Line] = field(default_factory=list)
-    after: int = 0
-    program: Changes = field(default_factory=dict)
-
-
-def compare_lines(flown: Iterable[Line], replayed: Iterable[Line]) -> LineComparison:
-    """Compare a flight's log with that of its replay, line by line."""
-    flown, replayed, result = list(flown), list(replayed), LineComparison(after=max(0, len(flown) - len(replayed)))
-    for flown_line, replayed_line in zip(flown, replayed, strict=False):
-        fields = dict(_compare_values(flown_line, replayed_line))
-        if flown_line.get("kind") == "start":
-            result.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM_FIELDS}
-        if fields:
-            result.others.append({**_identify_line(flown_line), "fields": fields})
-        else:
-            result.alike += 1
-    result.others += [{**_identify_line(line), "only_in": "replay"} for line in replayed[len(flown) :]]
-    return result
-
-
-def _identify_line(line: Line) -> Line:
-    return {"kind": line.get("kind"), "t_mono_s": line.get("t_mono_s") or 0.0, "query": line.get("query")}
-
-
-def _compare_values(flown: Any, replayed: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
-    if isinstance(flown, dict) and isinstance(replayed, dict):
-        for key in flown | replayed:
-            yield from _compare_values(flown.get(key), replayed.get(key), f"{name}.{key}" if name else key)
-    elif flown != replayed or type(flown) is not type(replayed):
-        yield name, (flown, replayed)

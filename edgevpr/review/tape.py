@@ -1,6 +1,5 @@
 """Plays back the tape of a recorded flight, for `replay`: the code's reads of the outside world (clock, frame,
-temperature) return the values that they returned in the flight, and its link receives what it received then. The
-packets that it sends are compared byte by byte with those of the flight.
+temperature) return the values that they returned in the flight, and its link receives what it received then.
 
 `runtime.flight.boundary` defines what is on the tape."""
 
@@ -9,7 +8,6 @@ import logging
 from base64 import b64decode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, cast
@@ -26,12 +24,12 @@ from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.ports import LINK_LOST
 from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.turns import Turns
-from edgevpr.mavlink.wire import Message, mavlink
+from edgevpr.mavlink.wire import Message
+from edgevpr.review.compare import PacketComparison
 from edgevpr.runtime.flight.boundary import LINK, SOURCE_STATE_DEFAULTS, Tape
 from edgevpr.runtime.flight.stop import StopNow
 
 Note = list[Any]  # a line of the tape: a kind and its values
-_SIGNATURE_BYTES = 13
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
 
 _log = logging.getLogger(__name__)
@@ -228,32 +226,3 @@ def read_tape(path: Path) -> Iterator[Note]:
             except ValueError:
                 return
             yield note
-
-
-@dataclass(slots=True)
-class PacketComparison:
-    """Comparison of the packets sent by a flight and by its replay. `alike`: number of equal packets. `others`: a
-    sentence on each difference."""
-
-    alike: int = 0
-    others: list[str] = field(default_factory=list)
-
-    def compare(self, t_s: float, flown: bytes | None, replayed: bytes | None) -> None:
-        """Compare two packets (None: none was sent) at the time `t_s` on the flight's clock."""
-        if flown and replayed and _strip_sequence(flown) == _strip_sequence(replayed):
-            self.alike += 1
-        elif flown or replayed:
-            self.others.append(f"{t_s:.3f} s: flight {_describe_packet(flown)}, replay {_describe_packet(replayed)}")
-
-
-def _describe_packet(packet: bytes | None) -> str:
-    return str(mavlink.MAVLink(None).parse_buffer(packet)[0]) if packet else "no packet"
-
-
-def _strip_sequence(packet: bytes) -> bytes:
-    """Return a packet without its sequence number, which depends on the packets before it, its checksum, which depends
-    on that number, and its signature, whose key is not in the recording."""
-    if packet[0] != mavlink.PROTOCOL_MARKER_V2:
-        return packet[:2] + packet[3:-2]
-    signature_bytes = _SIGNATURE_BYTES if packet[2] & mavlink.MAVLINK_IFLAG_SIGNED else 0
-    return packet[:2] + packet[3:4] + packet[5 : -2 - signature_bytes]

@@ -1,6 +1,5 @@
 """Reads autopilot logs: ArduPilot DataFlash (.bin, .log), MAVLink telemetry (.tlog) and PX4 ULog (.ulg). Position and
-attitude over time and, if the autopilot triggered the camera, for each picture. Also reads the tracks of GPS receivers
-(.gpx)."""
+attitude over time and, if the autopilot triggered the camera, for each picture."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -14,12 +13,11 @@ import numpy as np
 
 from edgevpr.core.arrays import Array
 from edgevpr.core.errors import UsageError
-from edgevpr.frames.positions import GeoTag, parse_time
+from edgevpr.frames.positions import GeoTag
 from edgevpr.tracks.record import Attitude, Record, make_tag, make_track, require_package
 
 _FIX_3D = 3  # minimum GPS status for a position to be used
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
-_FIRST_YEAR = 1990  # a GPS receiver that does not know the time writes an earlier year
 _RECEIVERS = ("vehicle_gps_position", "sensor_gps")
 _PX4_TOPICS = (*_RECEIVERS, "vehicle_global_position", "vehicle_attitude", "vehicle_local_position", "camera_capture")
 
@@ -142,24 +140,3 @@ def _interpolate_attitudes(attitude: dict[str, Array], times_us: Array) -> list[
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     return list(zip(*np.degrees([yaw, roll, pitch]).tolist(), strict=True))
-
-
-def read_gpx(path: Path) -> Record:
-    """Read all track points of a GPX file that have a time; a time without a zone is UTC."""
-    require_package("gpxpy", "A GPX file")
-    import gpxpy
-    from gpxpy.gpx import GPXException
-
-    try:
-        content = gpxpy.parse(path.read_bytes())
-    except (OSError, GPXException, UnicodeDecodeError, ValueError) as error:
-        raise UsageError(f"{path} cannot be read as GPX ({error}): export the track again.") from error
-    points = [point for point, *_ in content.walk()]
-    timed_points = [point for point in points if point.time and point.time.year >= _FIRST_YEAR]
-    if points and not timed_points:
-        raise UsageError(f"{path} has no times, which are needed to place pictures: export the track with times.")
-    lines = [
-        (parse_time(point.time.isoformat()), make_tag(point.latitude, point.longitude, point.elevation))
-        for point in timed_points
-    ]
-    return Record(kind="GPX track", track=make_track(path, lines))

@@ -32,7 +32,7 @@ class Record:
 def read_record(path: Path) -> Record:
     """Read a recording. The extension determines its type: .bin, .log, .tlog, .ulg, .srt, .gpx or .jsonl; any other
     file is a table. Raises UsageError for a file that cannot be read or has no position."""
-    from edgevpr.tracks import edgevpr_logs, logs, srt, tables
+    from edgevpr.tracks import edgevpr_logs, gpx, logs, srt, tables
 
     if not path.is_file():
         raise UsageError(f"{path} does not exist: choose a log, a track, subtitles or a table.")
@@ -42,7 +42,7 @@ def read_record(path: Path) -> Record:
         ".tlog": logs.read_telemetry,
         ".ulg": logs.read_px4,
         ".srt": srt.read_subtitles,
-        ".gpx": logs.read_gpx,
+        ".gpx": gpx.read_gpx,
         ".jsonl": edgevpr_logs.read_flight,
     }
     record = readers.get(path.suffix.lower(), tables.read_table)(path)

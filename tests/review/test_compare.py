@@ -1,6 +1,6 @@
 """A flight held against its replay, line by line."""
 
-from edgevpr.review.replay import compare_lines
+from edgevpr.review.compare import compare_lines
 
 START = {"kind": "start", "t_mono_s": 1.0, "version": "1"}
 QUERIES = [{"kind": "query", "t_mono_s": 2.0 + at, "query": f"{at}.png", "fix": {"sent": True}} for at in range(3)]

@@ -13,7 +13,8 @@ from mavlink_peers import Peer, UdpPort
 
 from edgevpr.cli.main import main
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.review.replay import compare_lines, replay
+from edgevpr.review.compare import compare_lines
+from edgevpr.review.replay import replay
 from edgevpr.runtime.flight.recording import TAPE, list_recordings
 
 pytestmark = pytest.mark.slow
