@@ -81,12 +81,11 @@ class QueryResult:
 
 def query_map(search: MapSearch, pictures: Iterable[tuple[int, LevelledImage]]) -> Iterator[QueryResult]:
     """Query the map with altered pictures of its own places, in all three ways, and yield the results. `pictures` are
-    pairs of a place id and its picture as encoded for the map. Places that are not in the index are skipped. The rule
-    of the `search` is changed to reject hardly any match for low confidence."""
+    pairs of a place id and its picture as encoded for the map. Places that are not in the index are skipped."""
     rng = np.random.default_rng((_SEED, 0))
     assert search.rule.confidence_rule is not None  # set for techniques with a confidence model
     low_precision_rule = replace(search.rule.confidence_rule, precision=_LOW_PRECISION)
-    search.rule = replace(search.rule, confidence_rule=low_precision_rule)
+    search = search.replace_rule(confidence_rule=low_precision_rule)
     index, looks_down = search.index, search.technique.spec.looks_down
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
@@ -145,7 +144,7 @@ def calibrate(
             (place_id, encoded.descriptor)
             for place_id, encoded in _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
         )
-        search.rule = replace(search.rule, look_alikes=measure_look_alikes(search, descriptors))
+        search = search.replace_rule(look_alikes=measure_look_alikes(search, descriptors))
     count = count_queries(technique)
     queries = (
         (place_id, frame.picture) for place_id, frame in _encode_pictures(encoder, place_map, pictures, progress, count)

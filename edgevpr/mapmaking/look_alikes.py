@@ -6,7 +6,9 @@ looks down, landmarks distinguish similar places in flight, so look-alikes are o
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +59,12 @@ class MapSearch:
         self.index, self._layers = load_index(place_map, technique), read_layers(place_map)
         self.near_m = max(rule.neighbour_m, self._layers.median_m or self.index.spacing_m() or 0.0)
         self.slots = {int(place_id): slot for slot, place_id in enumerate(self.index.place_ids)}
+
+    def replace_rule(self, **changes: Any) -> "MapSearch":
+        """Return the same search with these fields of its rule changed."""
+        search = copy(self)
+        search.rule = replace(self.rule, **changes)
+        return search
 
     def find_same_ground(self, slot: int) -> Bools:
         """Return bool (N,), True for each place in the index that may share ground with the place `slot`."""
