@@ -54,8 +54,12 @@ def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> It
     """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order in
     which the places were added."""
     spec = place_map.spec
-    for place_id in [place_id for place_id, _ in place_map.scan_rows("1")] if only is None else sorted(only):
-        content, problem = _read_content(place_map, place_id)
+    unscanned = ((place_id, None) for place_id in sorted(only or ()))
+    for place_id, row in place_map.scan_rows(rows.ALL_COLUMNS) if only is None else unscanned:
+        if row is None:  # not scanned, or the scan could not read it
+            content, problem = _read_content(place_map, place_id)
+        else:
+            content, problem = rows.read_columns(rows.ALL_COLUMNS, row), None
         is_usable = False
         try:
             if content:
