@@ -236,8 +236,8 @@ def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
     """Return the view of an image that cannot be warped because its lens is unknown. Only `nadir_offset_m` is set or,
-    if the image is tilted too far, only `reason`; nothing if too little is known. Arguments are as in `level_image`;
-    impossible values never raise."""
+    for a level image of unknown heading or height, `nadir_offset` with its error or, if the image is tilted too far,
+    `reason`; nothing if too little is known. Arguments are as in `level_image`; impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -246,7 +246,7 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
     if tilt_deg > MAX_TILT_UNLEVELLED_DEG:
         return View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": tilt_deg}))
     if heading_deg is None or height_m is None or not 0 <= height_m <= _MAX_HEIGHT_M:
-        # Without tilt the image's middle is the nadir, whatever its heading, height and lens (at least 53 degrees).
+        # A level image shows the nadir in its middle. The error is that of a lens of 53 degrees, less if it is wider.
         is_level = tilt_deg < _MIN_TILT_DEG
         return View(nadir_offset=(0.0, 0.0), nadir_offset_sd=REPORTED_TILT_SD) if is_level else UNKNOWN_VIEW
     heading = math.radians(heading_deg)

@@ -115,9 +115,8 @@ class Evidence:
           place does: from another spot, each of the two may look more like the other."""
         if self.likeness is None:
             return False
-        if self.twin is None and self.lead < _MIN_LEAD_OVER_TWIN:
-            return (self.proof or 0.0) < _MIN_PROOF
-        if self.has_small_lead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
+        may_have_twin = self.twin is None and self.lead < _MIN_LEAD_OVER_TWIN
+        if may_have_twin or (self.has_small_lead and (self.rank_gap or 0.0) > _MAX_RANK_GAP):
             return (self.proof or 0.0) < _MIN_PROOF
         if self.apart is not None:
             return self.apart < SMALL_LEAD and not self.proof

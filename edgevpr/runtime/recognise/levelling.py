@@ -114,8 +114,9 @@ def make_levelling(
     lens = read_camera_lens(config)
     if lens is None:
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
-    is_on_gimbal, mount = config.gimbal, read_mount(config)
-    return Levelling(lens, below=below, is_on_gimbal=is_on_gimbal, is_live=is_live(config.uri), mount=mount)
+    return Levelling(
+        lens, below=below, is_on_gimbal=config.gimbal, is_live=is_live(config.uri), mount=read_mount(config)
+    )
 
 
 def read_camera_lens(config: SourceConfig) -> Lens | None:
