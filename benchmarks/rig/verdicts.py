@@ -19,7 +19,7 @@ from edgevpr.runtime.flight.flightlog import read_log
 # Limits for how much worse than its control a flight with edgevpr may be.
 MARGIN_M = 3.0
 MARGIN_S = 5.0
-MAX_CONTROLS = 3  # flights of a control, if a flight is worse than the first: chance moves one that lands blind
+MAX_CONTROLS = 3  # flights of a control, if a flight is worse than the first
 FIRST_POSITION_S = 60.0  # after a start of the autopilot, which itself needs 25 s to get a position
 _GPS_ERROR_M = 5.0  # the estimate uses GPS again once its error stays below this
 _DISTANCES = {"strayed_m": "strays {:.0f} m", "sank_m": "sinks {:.0f} m", "error_m": "estimate {:.0f} m off"}
@@ -165,8 +165,8 @@ Largest values of that time in metres, each followed by that of the control (alo
 planned path, loss of height, and error of the autopilot's estimate. Then the seconds from the return of GPS until this
 error stays within {_GPS_ERROR_M:.0f} m, the number of positions sent, and the queries accepted in the whole flight.
 
-A flight that is worse than its control is compared with the largest values of {MAX_CONTROLS} controls: where an
-aircraft lands blind, chance moves it by tens of metres.
+A flight that is worse than its control is compared with the largest values of {MAX_CONTROLS} controls, because chance
+moves a PX4 that lands without a position by tens of metres.
 
 Right: compared with the controls, no distance is more than {MARGIN_M:.0f} m worse, and GPS is used again at most
 {MARGIN_S:.0f} s later; positions come within {FIRST_POSITION_S:.0f} s of a start of the autopilot, none while paused.
