@@ -90,7 +90,7 @@ def run_match(args: Namespace) -> int:
             matches[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(format_matches(matches))
     if not is_calibrated and list_evidence_kinds(place_map.spec):
-        lines.append(f"The map is {explain_not_calibrated(len(place_map))}.")
+        lines.append(f"The map is {explain_not_calibrated(place_map.spec, len(place_map))}.")
     if known_fields:
         lines.append(f"Known for each query: {','.join(known_fields)}.")
     if weights := describe_weights(recogniser.technique.spec):

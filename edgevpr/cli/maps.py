@@ -228,7 +228,7 @@ def run_map_info(args: Namespace) -> None:
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.describe()}"
     else:
-        confidence = explain_not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
+        confidence = explain_not_calibrated(info.spec, info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
     ram_mb = info.places * place_bytes / 1e6
     figures = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
     lines = list(format_info(info, confidence, ram_mb))

@@ -86,7 +86,7 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
             uri,
         )
     if total and places is not None and total + places < MIN_PLACES:
-        text = "at most %d places: a map of fewer than %d cannot be calibrated and recognises little; add pictures"
+        text = "at most %d places: a map of fewer than %d uses the default confidence model; add pictures"
         _log.warning(text, total + places, MIN_PLACES)
 
 

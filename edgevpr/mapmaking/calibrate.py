@@ -13,7 +13,7 @@ that decides which place it is (`Model.of_place`), and only as far as the result
 the query shows mapped ground is not changed: pictures of other ground agree by chance about equally in every map.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
@@ -54,6 +54,7 @@ LEFT_OUT = "left out"
 MIRRORED = "mirrored"
 FORWARD_QUERIES = 120
 NADIR_QUERIES = 60  # fewer, because each query takes longer
+_MAX_QUERIES_OF_PLACE = 4  # from its picture, in a map of few places
 _MAX_WITHOUT_POSITION = 0.2  # fraction of places; in nadir maps the order of pictures does not reveal overlaps
 _LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results, because flights outside the map are rarer
 # Prior precisions of weights and bias around the default model (see `fit_logistic`). Chosen on corridor and
@@ -123,8 +124,9 @@ def calibrate(
     """Calibrate a map that is open for writing, and store the result in it. `pictures` reads the pictures with the
     given names; `progress` wraps the iteration over these frames to report progress. `encoder`: the one that made the
     map.
-    Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their pictures
-    are found. Raises MapError if the map file cannot be read or written.
+    A map of fewer than MIN_PLACES keeps the default models: its results are too few to fit them. Raises UsageError if
+    the technique has no confidence model, the map has too few places (looking down), or too few of their pictures are
+    found. Raises MapError if the map file cannot be read or written.
     """
 
     def require(condition: object, problem: str) -> None:
@@ -136,7 +138,11 @@ def calibrate(
     require(kinds, f"{technique.spec.name} judges matches by score and margin; only `cohog` computes a confidence")
     search = MapSearch(place_map, technique, make_accept_rule(technique, config), meter)
     index = search.index
-    require(len(index) >= MIN_PLACES, f"it has {len(index)} places, but {MIN_PLACES} are needed")
+    can_fit = len(index) >= MIN_PLACES
+    require(
+        can_fit or (len(index) and not technique.spec.looks_down),
+        f"it has {len(index)} places, but {MIN_PLACES} are needed",
+    )
     has_positions = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
     require(has_positions, "too many places lack a position, so it is unknown which of them show the same ground")
     if not technique.spec.looks_down:
@@ -145,20 +151,20 @@ def calibrate(
             for place_id, encoded in _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
         )
         search = search.replace_rule(look_alikes=measure_look_alikes(search, descriptors))
-    count = count_queries(technique)
+    count = min(count_queries(technique), _MAX_QUERIES_OF_PLACE * len(index))
     queries = (
         (place_id, frame.picture) for place_id, frame in _encode_pictures(encoder, place_map, pictures, progress, count)
     )
     results = list(query_map(search, queries))
-    place_count = len({result.place_id for result in results})
+    place_count, min_places = len({result.place_id for result in results}), max(1, min(len(index), MIN_PLACES))
     require(
-        place_count >= MIN_PLACES,
-        f"pictures of only {place_count} places were found, but {MIN_PLACES} are needed; pass the pictures that it was "
+        place_count >= min_places,
+        f"pictures of only {place_count} places were found, but {min_places} are needed; pass the pictures that it was "
         "made from, with the same camera and mask",
     )
-    calibration = replace(
-        _fit_calibration(results, kinds, config.accept_precision), look_alikes=search.rule.look_alikes
-    )
+    models = _fit_models(results, kinds) if can_fit else {}
+    calibration = _make_calibration(results, kinds, models, config.accept_precision)
+    calibration = replace(calibration, look_alikes=search.rule.look_alikes)
     place_map.record_calibration(format_calibration(calibration))
     return calibration
 
@@ -176,7 +182,7 @@ def _encode_pictures(
     ids_by_image = {name: ids for (name,), ids in place_map.select_ids("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[index] for index in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
-    frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
+    frames = (frame for done in range(0, count, max(len(names), 1)) for frame in pictures(names[: count - done]))
     for frame in progress(frames, count, "calibrating"):
         encoded = encoder.encode(frame)
         for place_id in ids_by_image.get(escape_name(frame.name), ()):
@@ -185,12 +191,18 @@ def _encode_pictures(
                 break
 
 
-def _fit_calibration(results: Sequence[QueryResult], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Fit the models of all `kinds` of evidence to the results, and count the matches accepted at this `precision`."""
-    usable = [result for result in results if result.evidence]
-    made_of = f"{len(usable)} answers of the map itself"
-    models = {kind: adapt_model(read_default_model(kind), kind, usable, made_of) for kind in kinds}
-    rule = ConfidenceRule(models, precision)
+def _fit_models(results: Sequence[QueryResult], kinds: Sequence[str]) -> dict[str, Model]:
+    """Fit the models of all `kinds` of evidence to the results."""
+    made_of = f"{sum(result.evidence is not None for result in results)} answers of the map itself"
+    return {kind: adapt_model(read_default_model(kind), kind, results, made_of) for kind in kinds}
+
+
+def _make_calibration(
+    results: Sequence[QueryResult], kinds: Sequence[str], models: Mapping[str, Model], precision: float
+) -> MapCalibration:
+    """Return the calibration with these `models` (a missing one: the default), and count the matches accepted at this
+    `precision`."""
+    rule = ConfidenceRule({kind: models.get(kind) or read_default_model(kind) for kind in kinds}, precision)
     accepted = [
         result
         for result in results
@@ -206,7 +218,7 @@ def _fit_calibration(results: Sequence[QueryResult], kinds: Sequence[str], preci
         made=date.today().isoformat(),
         asked=len(in_map),
         precision=precision,
-        accepted=sum(result.way == THERE for result in accepted) / len(in_map),
+        accepted=sum(result.way == THERE for result in accepted) / max(len(in_map), 1),
         accepted_wrong=sum(not result.right for result in accepted),
         recognisable={place_id: round(float(np.mean(values)), 4) for place_id, values in sorted(confidences.items())},
     )

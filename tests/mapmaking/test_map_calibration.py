@@ -91,6 +91,18 @@ def test_calibration_is_stored_in_the_map(place_map):
     assert 0 <= found.accepted <= 1
 
 
+@pytest.mark.parametrize("count", [1, 2, PLACES - 1])
+def test_calibration_of_few_places_keeps_the_default_models_and_knows_look_alikes(tmp_path, count):
+    few = [frame(number) for number in range(count)]
+    with PlaceMap.open_for_writing(make_map(tmp_path / "m.gpkg", AHEAD, few)) as place_map:
+        with pytest.raises(UsageError, match=f"pictures of only {count - 1} places"):
+            calibrate_map(place_map, make_picture_source(*few[1:])[0])
+        found = calibrate_map(place_map, make_picture_source(*few)[0])
+        assert make_accept_rule(AHEAD, CONFIG, 1, found).look_alikes == found.look_alikes
+    assert (found.models, found.asked, found.accepted_wrong) == ({}, min(2 * PLACES, 4 * count), 0)
+    assert len(found.look_alikes.places) == (count if count > 2 else 0), "the only other place is a neighbour"
+
+
 def test_calibration_skips_an_unreadable_place(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")

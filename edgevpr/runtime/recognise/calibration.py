@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.confidence import Model, parse_model
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES, LookAlike, LookAlikes
 
-MIN_PLACES = 30  # a map with fewer is not calibrated
+MIN_PLACES = 30  # a map with fewer keeps the default models, and looking down it is not calibrated
 _MIN_CONFIDENCE = 0.5  # mean confidence below which a place is hard to recognise
 _CHECKSUM_DIGITS = 8
 
@@ -23,10 +24,11 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCalibration:
     """Calibration of a map: the result of querying it with `asked` altered images of its own places. `models` maps
-    kinds of evidence to the models adapted to the map, and `made` is the date. At the `precision` for which the map
-    was calibrated, the fraction `accepted` of the images is accepted. `accepted_wrong` of these matches are wrong,
-    including queries of places that were left out of the map for the test. `recognisable` maps the number of each
-    tested place to the mean confidence (0..1) of its correct matches. `look_alikes`: None for a camera looking down."""
+    kinds of evidence to the models adapted to the map, none in a map of fewer than MIN_PLACES; `made` is the date. At
+    the `precision` for which the map was calibrated, the fraction `accepted` of the images is accepted.
+    `accepted_wrong` of these matches are wrong, including queries of places that were left out of the map for the test.
+    `recognisable` maps the number of each tested place to the mean confidence (0..1) of its correct matches.
+    `look_alikes`: None for a camera looking down."""
 
     models: Mapping[str, Model]
     made: str
@@ -62,6 +64,8 @@ class MapCalibration:
         """Describe the calibration in one sentence: accepted and wrong matches, and places hard to recognise."""
         wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'} accepted"
         warning = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
+        if not self.models:
+            warning += f"; fewer than {MIN_PLACES} places: the default confidence model is used"
         return (
             f"of {self.asked} altered copies of its own images {100 * self.accepted:.0f} % were accepted, at a "
             f"precision of {100 * self.precision:.6g} %; {wrong}; {100 * self.hardly_recognisable:.0f} % of "
@@ -100,9 +104,9 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
     return calibration
 
 
-def explain_not_calibrated(places: int) -> str:
-    """Return a sentence that explains why a map with this number of places is not calibrated."""
-    if places < MIN_PLACES:
+def explain_not_calibrated(spec: TechniqueSpec, places: int) -> str:
+    """Return a sentence that explains why a map made with `spec`, with this number of places, is not calibrated."""
+    if spec.looks_down and places < MIN_PLACES:
         return f"not calibrated ({places} places, fewer than {MIN_PLACES}): the default confidence model is used"
     return "not calibrated: the default confidence model is used; `edgevpr map calibrate` adapts it to the map"
 

@@ -61,7 +61,9 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
         technique, confidence = explain_technique(recogniser, is_named=config.technique is not None), None
         if recogniser.rule.confidence_rule:
             calibration = read_calibration_for(place_map)
-            confidence = calibration.describe() if calibration else explain_not_calibrated(len(place_map))
+            confidence = (
+                calibration.describe() if calibration else explain_not_calibrated(place_map.spec, len(place_map))
+            )
     settings, machine = config.mavlink, read_model() or "this machine"
     if not board.is_this_machine():
         machine += f", not on {board.title}"
