@@ -7,12 +7,16 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space tilted sites sweeps mutants clean
+.PHONY: demo test run-tests test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space tilted sites sweeps mutants clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
-test: $(VENV)/installed $(VENV)/clients/installed lint docs
+# On two cores, lint and documents beside the tests.
+test: $(VENV)/installed $(VENV)/clients/installed
+	$(MAKE) --jobs 2 run-tests lint docs
+
+run-tests: $(VENV)/installed
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 # What needs no process, no network and no clock: under a minute.
@@ -121,5 +125,5 @@ $(VENV)/installed: pyproject.toml
 	@$(PYTHON) -c 'import struct, sys; sys.exit(None if struct.calcsize("P") == 8 else "edgevpr needs a 64-bit operating system: NumPy, OpenCV and onnxruntime have no wheels for 32 bits")'
 	@$(PYTHON) -m venv $(VENV) || { echo "No venv module: install it (Debian, Ubuntu: sudo apt install python3-venv)"; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e '.[dev]'
 	@touch $@

@@ -20,11 +20,20 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Files that take longest, most of them for a few tests that wait or start programs. They begin first: a process that
 # ended alone with one of them would leave the others idle.
 LONGEST = (
+    "test_never_worse",
     "test_frames_damage",
+    "test_navigator",
     "test_flight_process",
+    "test_feedback",
     "test_gate",
     "test_frames_live",
-    "test_fixes",
+    "test_replay",
+    "test_survey",
+    "test_levelling",
+    "test_agewatch",
+    "test_odometry_gaps",
+    "test_orthophoto_commands",
+    "test_map_calibration",
     "test_ground_stations",
     "test_memory",
     "test_demo",

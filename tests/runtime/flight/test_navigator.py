@@ -59,17 +59,17 @@ def test_fixes_with_a_new_error_are_accepted_after_a_reset(begins_anew):
 def test_navigator_keeps_an_autopilot_that_uses_its_fixes_within_metres_in_wind(fix_sd_m):
     air, alone = lose_gps(wind=WIND, fix_sd_m=fix_sd_m), lose_gps(wind=WIND)
     alone.takes_fixes = False
-    errors_m = norms(air.fly(300).errors_m)
-    assert norms(alone.fly(300).errors_m).max() > 1500
+    errors_m = norms(air.fly(150).errors_m)
+    assert norms(alone.fly(150).errors_m).max() > 700
     assert np.median(errors_m) < 2 + fix_sd_m
     assert errors_m.max() < 10 + 3 * fix_sd_m
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("speed_m_s", [15.0, 7.0])
 def test_navigator_never_worsens_good_dead_reckoning(speed_m_s, seed):
     """With matches as good as those over a refined map with ArduPilot in its simulator."""
-    air = lose_gps(speed_m_s=speed_m_s, fix_sd_m=0.6, said_sd_m=1.1, other_sd_m=0.0, seed=seed).fly(300)
+    air = lose_gps(speed_m_s=speed_m_s, fix_sd_m=0.6, said_sd_m=1.1, other_sd_m=0.0, seed=seed).fly(200)
     assert norms(air.errors_m).max() < 3.0, "and alone it is exact"
 
 
@@ -84,7 +84,7 @@ FLIGHT_SETTINGS = [
 @pytest.mark.parametrize("how", FLIGHT_SETTINGS)
 def test_navigator_claims_match_its_errors(how):
     known = []
-    for seed in range(3):
+    for seed in range(2):
         air = lose_gps(seed=seed, **how).fly(10)
         for _ in range(200):
             air.fly(1)
