@@ -69,6 +69,8 @@ class ReasonCode(Code):
     PLACE_UNREAD = "an unreadable place may be the correct one"
     NOT_CALIBRATED = "map is not calibrated", "{summary}: no confidence available"
     LOW_CONFIDENCE = "confidence too low", "{summary}: ", *_FIGURES
+    LOOKS_ALIKE = "another place may look the same", "{summary}: ", *_FIGURES
+    LANDMARKS_NEEDED = "too few landmarks to exclude a similar place", "{summary}: ", *_FIGURES
     ELSEWHERE_AGREES_BETTER = "another place matches better", "{summary}: ", *_FIGURES
     TRACK_CONTRADICTS = "the track filter contradicts the match", "{summary}: ", *_FIGURES
     ROTATION_AMBIGUOUS = "the same place matches nearly as well at another rotation", "{summary}: ", *_FIGURES

@@ -137,33 +137,26 @@ def calibrate(
     kinds = list_evidence_kinds(technique.spec)
     require(kinds, f"{technique.spec.name} judges matches by score and margin; only `cohog` computes a confidence")
     search = MapSearch(place_map, technique, make_accept_rule(technique, config), meter)
-    index = search.index
-    can_fit = len(index) >= MIN_PLACES
-    require(
-        can_fit or (len(index) and not technique.spec.looks_down),
-        f"it has {len(index)} places, but {MIN_PLACES} are needed",
-    )
-    has_positions = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
+    index, looks_down = search.index, technique.spec.looks_down
+    min_places = MIN_PLACES if looks_down else max(1, min(len(index), MIN_PLACES))
+    require(len(index) >= min_places, f"it has {len(index)} places, but {min_places} are needed")
+    has_positions = not looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
     require(has_positions, "too many places lack a position, so it is unknown which of them show the same ground")
-    if not technique.spec.looks_down:
-        descriptors = (
-            (place_id, encoded.descriptor)
-            for place_id, encoded in _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
-        )
+    if not looks_down:
+        encoded = _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
+        descriptors = ((place_id, frame.descriptor) for place_id, frame in encoded)
         search = search.replace_rule(look_alikes=measure_look_alikes(search, descriptors))
     count = min(count_queries(technique), _MAX_QUERIES_OF_PLACE * len(index))
-    queries = (
-        (place_id, frame.picture) for place_id, frame in _encode_pictures(encoder, place_map, pictures, progress, count)
-    )
-    results = list(query_map(search, queries))
-    place_count, min_places = len({result.place_id for result in results}), max(1, min(len(index), MIN_PLACES))
+    encoded = _encode_pictures(encoder, place_map, pictures, progress, count)
+    results = list(query_map(search, ((place_id, frame.picture) for place_id, frame in encoded)))
+    place_count = len({result.place_id for result in results})
     require(
         place_count >= min_places,
         f"pictures of only {place_count} places were found, but {min_places} are needed; pass the pictures that it was "
         "made from, with the same camera and mask",
     )
-    models = _fit_models(results, kinds) if can_fit else {}
-    calibration = _make_calibration(results, kinds, models, config.accept_precision)
+    models = {kind: read_default_model(kind) for kind in kinds}
+    calibration = _fit_calibration(results, models, config.accept_precision, can_fit=len(index) >= MIN_PLACES)
     calibration = replace(calibration, look_alikes=search.rule.look_alikes)
     place_map.record_calibration(format_calibration(calibration))
     return calibration
@@ -191,18 +184,14 @@ def _encode_pictures(
                 break
 
 
-def _fit_models(results: Sequence[QueryResult], kinds: Sequence[str]) -> dict[str, Model]:
-    """Fit the models of all `kinds` of evidence to the results."""
-    made_of = f"{sum(result.evidence is not None for result in results)} answers of the map itself"
-    return {kind: adapt_model(read_default_model(kind), kind, results, made_of) for kind in kinds}
-
-
-def _make_calibration(
-    results: Sequence[QueryResult], kinds: Sequence[str], models: Mapping[str, Model], precision: float
+def _fit_calibration(
+    results: Sequence[QueryResult], models: Mapping[str, Model], precision: float, can_fit: bool
 ) -> MapCalibration:
-    """Return the calibration with these `models` (a missing one: the default), and count the matches accepted at this
-    `precision`."""
-    rule = ConfidenceRule({kind: models.get(kind) or read_default_model(kind) for kind in kinds}, precision)
+    """Fit the default `models` to the results if `can_fit`, and count the matches accepted at this `precision`."""
+    if can_fit:
+        made_of = f"{sum(result.evidence is not None for result in results)} answers of the map itself"
+        models = {kind: adapt_model(model, kind, results, made_of) for kind, model in models.items()}
+    rule = ConfidenceRule(models, precision)
     accepted = [
         result
         for result in results
@@ -214,7 +203,7 @@ def _make_calibration(
         evidence = result.evidence if result.right and not result.refused else None
         confidences.setdefault(result.place_id, []).append(rule.confidence(evidence) if evidence else 0.0)
     return MapCalibration(
-        models=models,
+        models=models if can_fit else {},
         made=date.today().isoformat(),
         asked=len(in_map),
         precision=precision,

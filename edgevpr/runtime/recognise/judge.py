@@ -86,6 +86,12 @@ class ConfidenceRule:
         """Return the confidence to report: at most the highest that the model's training data support."""
         return min(self.confidence(evidence), self.models[evidence.kind].max_reported)
 
+    def explain(self, evidence: Evidence) -> ReasonCode:
+        """Return the code of a match with too low a confidence: what limits it, if its figures alone would suffice."""
+        if not self.models[evidence.kind].confidence(evidence.figures()) >= self.threshold(evidence):  # or is NaN
+            return ReasonCode.LOW_CONFIDENCE
+        return ReasonCode.LANDMARKS_NEEDED if evidence.is_unambiguous else ReasonCode.LOOKS_ALIKE
+
     def compute_map_confidence(self, evidence: Evidence) -> float:
         """Return the probability that the query with this evidence shows ground of the map."""
         return self.models[evidence.kind].map_confidence(evidence.figures())
@@ -248,7 +254,7 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
     is_tracked = track is not None and _is_track_confident(track, confidence, needed, rule.precision)
     if not (is_confident or (is_tracked and (findings.predicted or 0.0) >= _MIN_PREDICTED)):
-        code = ReasonCode.LOW_CONFIDENCE
+        code = rule.explain(evidence)
     elif evidence.lead < 0 and not is_confident:
         code = ReasonCode.ELSEWHERE_AGREES_BETTER
     elif track is not None and track < _MIN_TRACK_SUPPORT:

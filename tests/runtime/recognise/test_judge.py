@@ -77,11 +77,13 @@ def test_judge_requires_landmarks_or_track_for_weak_forward_regions():
     rule = make_rule(lambda evidence: 1.0, needed=0.9999)
     hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3, twin=-0.1)
     assert rule.confidence_rule.confidence(hardly) == 0.9
-    assert not decide(rule=rule, evidence=hardly).accepted
+    refused = decide(rule=rule, evidence=hardly)
+    assert (refused.accepted, refused.reason.code) == (False, ReasonCode.LANDMARKS_NEEDED)
     assert decide(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
     assert decide(rule=rule, evidence=hardly, track_confidence=0.9999).accepted
     twin = replace(hardly, landmarks=log_count(30), twin=0.1)
     assert rule.confidence_rule.confidence(twin) == 0.5
+    assert decide(rule=rule, evidence=twin).reason.code is ReasonCode.LOOKS_ALIKE
 
 
 @pytest.mark.parametrize(

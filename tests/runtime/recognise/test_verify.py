@@ -169,7 +169,7 @@ def test_verify_does_not_accept_nearly_duplicate_ground_by_landmarks(tmp_path, t
     event = run_query(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.best.place.source_image == "1.png"
     assert not event.accepted
-    assert event.reason.code is ReasonCode.LOW_CONFIDENCE
+    assert event.reason.code is ReasonCode.LOOKS_ALIKE
 
 
 def make_bare_frame(seed, right_px=0, down_px=0):
