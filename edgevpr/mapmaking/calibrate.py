@@ -54,7 +54,6 @@ LEFT_OUT = "left out"
 MIRRORED = "mirrored"
 FORWARD_QUERIES = 120
 NADIR_QUERIES = 60  # fewer, because each query takes longer
-_MAX_QUERIES_OF_PLACE = 4  # from its picture, in a map of few places
 _MAX_WITHOUT_POSITION = 0.2  # fraction of places; in nadir maps the order of pictures does not reveal overlaps
 _LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results, because flights outside the map are rarer
 # Prior precisions of weights and bias around the default model (see `fit_logistic`). Chosen on corridor and
@@ -146,7 +145,7 @@ def calibrate(
         encoded = _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
         descriptors = ((place_id, frame.descriptor) for place_id, frame in encoded)
         search = search.replace_rule(look_alikes=measure_look_alikes(search, descriptors))
-    count = min(count_queries(technique), _MAX_QUERIES_OF_PLACE * len(index))
+    count = count_queries(technique) if len(index) >= MIN_PLACES else len(index)
     encoded = _encode_pictures(encoder, place_map, pictures, progress, count)
     results = list(query_map(search, ((place_id, frame.picture) for place_id, frame in encoded)))
     place_count = len({result.place_id for result in results})

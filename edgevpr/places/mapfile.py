@@ -73,13 +73,15 @@ class PlaceMap(MapConnection):
     def add(
         self, frame: Frame, descriptor: Descriptor, salience: Salience | None = None, landmarks: bytes | None = None
     ) -> int:
-        """Add one place, and return its id once it is safely on disk. Raises MapError (disk full, ...).
+        """Add one place, and return its id once it is safely on disk. Drop the calibration, which does not know the
+        place. Raises MapError (disk full, ...).
 
         `salience` and `landmarks` (encoded bytes) are None if there are none. An impossible time or altitude is stored
         as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes.
         """
         content = rows.make_content(frame, descriptor, self.spec, salience, landmarks)
         with self.transaction():
+            self.db.execute("DELETE FROM edgevpr_map WHERE key = 'calibration'")
             return self.insert(content)
 
     def insert(self, content: Content, place_id: int | None = None) -> int:

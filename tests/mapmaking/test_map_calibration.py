@@ -99,7 +99,7 @@ def test_calibration_of_few_places_keeps_the_default_models_and_knows_look_alike
             calibrate_map(place_map, make_picture_source(*few[1:])[0])
         found = calibrate_map(place_map, make_picture_source(*few)[0])
         assert make_accept_rule(AHEAD, CONFIG, 1, found).look_alikes == found.look_alikes
-    assert (found.models, found.asked, found.accepted_wrong) == ({}, min(2 * PLACES, 4 * count), 0)
+    assert (found.models, found.asked, found.accepted_wrong) == ({}, count, 0)
     assert len(found.look_alikes.places) == (count if count > 2 else 0), "the only other place is a neighbour"
 
 

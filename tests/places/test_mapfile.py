@@ -139,12 +139,15 @@ def test_open_tolerates_damaged_metadata(map_path, value):
         assert (place_map.mask_sha256, place_map.calibration) == (None, None)
         place_map.record_mask("m")
         place_map.record_calibration("how sure")
+        place_map.add(frame(30), make_descriptor(30))
+        assert place_map.calibration is None, "it does not know the new place"
+        place_map.record_calibration("how sure")
     with PlaceMap.open(map_path) as place_map:
         assert (place_map.mask_sha256, place_map.calibration) == ("m", "how sure")
     write_sql(map_path, f"UPDATE edgevpr_map SET value = {value} WHERE key IN ('mask_sha256', 'calibration')")
     with PlaceMap.open(map_path) as place_map:
         assert (place_map.mask_sha256, place_map.calibration) == (None, None)
-        assert len(list(place_map.read_places())) == 10
+        assert len(list(place_map.read_places())) == 11
 
 
 def test_repair_map_keeps_place_ids_and_metadata(map_path, tmp_path):
