@@ -23,7 +23,7 @@ px4_channels = pytest.mark.parametrize("parameters", [SENSOR, VISION], ids=["mes
 with_and_without_matches = pytest.mark.parametrize("matches", [True, False], ids=["matches", "no matches"])
 
 
-def assert_no_worse(vehicle, event, *, watched_s=WATCHED_S, **setup):
+def assert_no_worse(vehicle, event, **setup):
     """Fly twice, with and without edgevpr, let an `event` happen to the autopilot in each flight, and compare them from
     its end. Returns the flight with edgevpr."""
     worst = []
@@ -31,15 +31,14 @@ def assert_no_worse(vehicle, event, *, watched_s=WATCHED_S, **setup):
         flight = ClosedLoop(vehicle, edgevpr=edgevpr, **setup).fly(SETTLED_S)
         event(flight)
         since_s = flight.now_s
-        worst.append(flight.fly(watched_s).worst_m(since_s))
+        worst.append(flight.fly(WATCHED_S).worst_m(since_s))
     (alone_away_m, alone_error_m), (away_m, error_m) = worst
     worse_m = {"away": round(away_m - alone_away_m, 1), "estimate": round(error_m - alone_error_m, 1)}
     assert max(worse_m.values()) <= MAX_WORSE_M, worse_m
     return flight
 
 
-@with_and_without_matches
-@pytest.mark.parametrize("satellites", [4, 5])
+@pytest.mark.parametrize(("satellites", "matches"), [(4, True), (5, False)])
 def test_receiver_with_few_satellites_is_not_replaced_by_ours(satellites, matches):
     def lose_satellites(flight):
         flight.set("SIM_GPS1_NUMSATS", satellites)
@@ -98,25 +97,23 @@ def test_odometry_over_lower_ground_is_correct_once_matches_show_its_height():
     assert flight.fly(20).error_m[-1] < 15.0
 
 
-@px4_channels
-@pytest.mark.parametrize("map_off_m", [8, 20])
+@pytest.mark.parametrize(("map_off_m", "parameters"), [(8, SENSOR), (20, VISION)])
 def test_px4_uses_gps_again_after_a_test_without_gps(map_off_m, parameters):
     def suspend_gps(flight):
         flight.map_off_m = map_off_m
         flight.set("EKF2_GPS_CTRL", 0).fly(20)
         flight.set("EKF2_GPS_CTRL", 7).fly(GPS_AGAIN_S + 5)  # it has to fly back
 
-    assert_no_worse("px4-copter", suspend_gps, watched_s=60.0, **parameters)
+    assert_no_worse("px4-copter", suspend_gps, **parameters)
 
 
-@px4_channels
-@with_and_without_matches
+@pytest.mark.parametrize(("matches", "parameters"), [(True, SENSOR), (False, VISION)])
 def test_px4_uses_gps_again_after_a_receiver_was_flagged_as_spoofed(matches, parameters):
     def flag(flight):
         flight.set("SIM_GPS_SPOOF", 1).fly(20)
         flight.set("SIM_GPS_SPOOF", 0).fly(GPS_AGAIN_S)
 
-    flight = assert_no_worse("px4-copter", flag, matches=matches, watched_s=60.0, velocity_m_s=10j, **parameters)
+    flight = assert_no_worse("px4-copter", flag, matches=matches, velocity_m_s=10j, **parameters)
     assert not flight.positions_sent(SETTLED_S + 20 + GPS_AGAIN_S)
 
 
@@ -149,7 +146,7 @@ def test_map_with_an_offset_moves_no_aircraft_with_good_gps(vehicle, parameters)
     def shift_map(flight):
         flight.map_off_m = 8
 
-    assert_no_worse(vehicle, shift_map, watched_s=60.0, **parameters)
+    assert_no_worse(vehicle, shift_map, **parameters)
 
 
 def test_copter_with_our_receiver_continues_after_the_loss_of_gps():

@@ -265,8 +265,7 @@ def test_survey_withdraws_its_report_when_gps_becomes_wrong(tmp_path):
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5)
 
 
-@pytest.mark.parametrize("map_sd_m", [5.0, 1.0])
-@pytest.mark.parametrize("way", [fly_eights, fly_lanes, fly_circle])
+@pytest.mark.parametrize(("way", "map_sd_m"), [(fly_eights, 5.0), (fly_lanes, 1.0), (fly_circle, 5.0)])
 def test_images_are_levelled_by_the_measured_mount_so_that_gps_agrees(tmp_path, way, map_sd_m):
     flown = SurveyRun(tmp_path, make_matches(way, 1800, scale=0.0), map_sd_m)
     known_s = next(line["t_mono_s"] for line in flown.lines if line["ahead_deg"])
