@@ -20,6 +20,7 @@ from edgevpr.mapmaking.calibrate import count_queries, query_map
 from edgevpr.mapmaking.look_alikes import MapSearch
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.ranking import outside_neighbourhood
+from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.judge import make_accept_rule
 
@@ -60,7 +61,7 @@ def yield_rows(name: str, folder: Path) -> Iterator[Row]:
     dataset = walks.load_matched_set(folder)
     scored = {query.path.name: query for query in dataset.queries}
     with walks.make_map(folder, images=folder / "ref") as (place_map, index, technique):
-        rule = make_accept_rule(technique, walks.make_config().match)
+        rule = make_accept_rule(technique, walks.make_config().match, 1, read_calibration_for(place_map))
         rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))  # so that only vetoes refuse
         walk = walks.make_walk(place_map, index, technique, rule=rule, all_evidence=True)
         for query_set in [set_folder.name for set_folder in base.find_sets()] + list(FOREIGN_ONLY_SETS):

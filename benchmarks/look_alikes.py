@@ -2,23 +2,30 @@
 
 Each map is calibrated as by `map build`. Every query is matched twice: in the map, and in the map without its place and
 the places that show the same ground, where each accepted match is wrong (*left_out*). *unproven*: right matches with at
-most 8 agreeing landmarks, which would be lost if every match needed landmarks.
+most 8 agreeing landmarks, which would be lost if every match needed landmarks. *repeats*: matches accepted in another
+map, of which each place shows only the middle of its picture, around which is the picture of a place half the map away,
+as if the same door, furrow or shelf were elsewhere; all of them are wrong.
 """
 
 import argparse
+import tempfile
+from pathlib import Path
 
 import base
+import cv2
 import numpy as np
 import walks
 from base import DATA
 
+from edgevpr.core.arrays import Image
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.evidence import CHANCE_INLIERS, count_neighbours
 
 SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
 _NEIGHBOURS_LEFT_OUT = 8  # places along the route, on both sides
-_COLUMNS = {name: f"{{{name}}}" for name in ("set", "queries", "right", "unproven", "wrong", "left_out")}
+_REPEATED = 0.7  # of the width and height of a picture
+_COLUMNS = {name: f"{{{name}}}" for name in ("set", "queries", "right", "unproven", "wrong", "left_out", "repeats")}
 
 
 def measure_set(name: str) -> base.Row:
@@ -44,7 +51,33 @@ def measure_set(name: str) -> base.Row:
             remaining = index.select(np.all(masks, axis=0))
             without = walks.make_walk(place_map, remaining, technique, rule=walk.rule)
             row["left_out"] += without.step(walks.make_frame(query.path)).accepted
-    return row
+    return row | {"repeats": count_repeats(folder)}
+
+
+def count_repeats(folder: Path) -> int:
+    """Match all queries of a set in a map of repeats, calibrated as by `map build`; return how many are accepted."""
+    frames = list(walks.read_folder_frames(folder / "ref"))
+    with tempfile.TemporaryDirectory() as temporary:
+        images = Path(temporary) / "ref"
+        images.mkdir()
+        for frame, other in zip(frames, np.roll(np.arange(len(frames)), len(frames) // 2), strict=True):
+            cv2.imwrite(str(images / f"{Path(frame.name).stem}.png"), draw_repeat(frame.image, frames[other].image))
+        technique = walks.make_cohog(base.infer_camera(folder.name))
+        with walks.make_map(images.parent, technique, images) as (place_map, index, technique):
+            walk = walks.make_walk(place_map, index, technique)
+            queries = walks.load_matched_set(folder).queries
+            return sum(walk.step(walks.make_frame(query.path)).accepted for query in queries)
+
+
+def draw_repeat(picture: Image, surroundings: Image) -> Image:
+    """Return the middle of a picture in other surroundings, with a soft edge."""
+    height, width = picture.shape[:2]
+    surroundings = cv2.resize(surroundings, (width, height), interpolation=cv2.INTER_AREA)
+    top, left = round((1 - _REPEATED) / 2 * height), round((1 - _REPEATED) / 2 * width)
+    share = np.zeros((height, width, *[1] * (picture.ndim - 2)), np.float32)
+    share[top:-top, left:-left] = 1.0
+    share = cv2.GaussianBlur(share, (0, 0), 0.02 * width).reshape(share.shape)
+    return np.round(share * picture + (1 - share) * surroundings).astype(np.uint8)
 
 
 def main() -> None:
