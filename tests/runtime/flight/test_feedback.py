@@ -31,8 +31,17 @@ def hover(min_accuracy_m, gyro_sd, show_tilt, seconds=120):
 hover_once = cache(hover)
 
 
-@pytest.mark.parametrize("min_accuracy_m", [0.1, 1.0, 20.0])
-@pytest.mark.parametrize(("gyro_sd", "show_tilt"), [(GOOD_SD, True), (GOOD_SD, False), (SIM_SD, True)])
+@pytest.mark.parametrize(
+    ("min_accuracy_m", "gyro_sd", "show_tilt"),
+    [
+        (0.1, GOOD_SD, True),
+        (20.0, GOOD_SD, True),
+        (0.1, GOOD_SD, False),
+        (2.0, GOOD_SD, False),
+        (0.1, SIM_SD, True),
+        (1.0, SIM_SD, True),
+    ],
+)
 def test_loop_is_stable_for_each_claimed_accuracy(min_accuracy_m, gyro_sd, show_tilt):
     away_m = hover_once(min_accuracy_m, gyro_sd, show_tilt)
     room_m = max(3.0, min_accuracy_m) * (2.0 if gyro_sd == SIM_SD else 1.0)

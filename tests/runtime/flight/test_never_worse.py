@@ -57,9 +57,8 @@ def test_source_set_with_odometry_does_not_diverge_with_gps(matches):
     assert_no_worse("arducopter", choose_second_set, matches=matches, **ODOMETRY)
 
 
-@with_and_without_matches
 @pytest.mark.parametrize(
-    "parameters", [{"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, {"GPS_AUTO_SWITCH": 2}], ids=["primary", "blended"]
+    ("matches", "parameters"), [(True, {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}), (False, {"GPS_AUTO_SWITCH": 2})]
 )
 def test_receiver_of_ours_does_not_diverge_while_used_with_gps(parameters, matches):
     assert_no_worse("arducopter", lambda flight: None, matches=matches, **GPS_INPUT, **parameters)

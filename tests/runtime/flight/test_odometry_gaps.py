@@ -46,8 +46,15 @@ def fly_across_gap(air, seconds=GAP_S):
     return [error for error, _ in found], np.array([said for _, said in found])
 
 
-@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
-@pytest.mark.parametrize(("stretch", "turn"), [(1.0, 0.0), (1.05, 0.0), (1.0, 0.06)])
+@pytest.mark.parametrize(
+    ("channel", "stretch", "turn"),
+    [
+        (Channel.COMMAND, 1.0, 0.0),
+        (Channel.GPS_INPUT, 1.05, 0.0),
+        (Channel.COMMAND, 1.0, 0.06),
+        (Channel.GPS_INPUT, 1.0, 0.06),
+    ],
+)
 def test_odometry_bridges_a_minute_off_the_map_to_three_per_cent_of_the_distance(channel, stretch, turn):
     air = make_air(channel, stride_sd_m=0.2)
     air.stretch, air.turn = stretch, turn

@@ -56,9 +56,8 @@ def test_step_accepts_no_image_of_an_unreal_scene(walk):
 
 def test_step_accepts_only_the_correct_place_for_a_mostly_hidden_image(walk):
     recognised = 0
-    for number in (2, 5):
-        for kind, picture in unreal_pictures.yield_spoilt(9000 + number, draw_texture(number, 240, 320)):
-            event = walk.step(frame(picture, kind))
-            assert not event.accepted or event.best.place.source_image == f"{number}.png", kind
-            recognised += event.accepted
+    for kind, picture in unreal_pictures.yield_spoilt(9002, draw_texture(2, 240, 320)):
+        event = walk.step(frame(picture, kind))
+        assert not event.accepted or event.best.place.source_image == "2.png", kind
+        recognised += event.accepted
     assert recognised > 0, "what is left is often enough"
