@@ -18,11 +18,12 @@ import walks
 from base import DATA
 
 from edgevpr.core.arrays import Image
+from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.evidence import CHANCE_INLIERS, count_neighbours
 
-SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
+SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons", "grief_michigan_monthly", "grief_stromovka_monthly")
 _NEIGHBOURS_LEFT_OUT = 8  # places along the route, on both sides
 _REPEATED = 0.7  # of the width and height of a picture
 _COLUMNS = {name: f"{{{name}}}" for name in ("set", "queries", "right", "unproven", "wrong", "left_out", "repeats")}
@@ -51,10 +52,10 @@ def measure_set(name: str) -> base.Row:
             remaining = index.select(np.all(masks, axis=0))
             without = walks.make_walk(place_map, remaining, technique, rule=walk.rule)
             row["left_out"] += without.step(walks.make_frame(query.path)).accepted
-    return row | {"repeats": count_repeats(folder)}
+    return row | {"repeats": count_repeats(folder, dataset)}
 
 
-def count_repeats(folder: Path) -> int:
+def count_repeats(folder: Path, dataset: Dataset) -> int:
     """Match all queries of a set in a map of repeats, calibrated as by `map build`; return how many are accepted."""
     frames = list(walks.read_folder_frames(folder / "ref"))
     with tempfile.TemporaryDirectory() as temporary:
@@ -63,10 +64,9 @@ def count_repeats(folder: Path) -> int:
         for frame, other in zip(frames, np.roll(np.arange(len(frames)), len(frames) // 2), strict=True):
             cv2.imwrite(str(images / f"{Path(frame.name).stem}.png"), draw_repeat(frame.image, frames[other].image))
         technique = walks.make_cohog(base.infer_camera(folder.name))
-        with walks.make_map(images.parent, technique, images) as (place_map, index, technique):
+        with walks.make_map(images.parent, technique, images) as (place_map, index, _):
             walk = walks.make_walk(place_map, index, technique)
-            queries = walks.load_matched_set(folder).queries
-            return sum(walk.step(walks.make_frame(query.path)).accepted for query in queries)
+            return sum(walk.step(walks.make_frame(query.path)).accepted for query in dataset.queries)
 
 
 def draw_repeat(picture: Image, surroundings: Image) -> Image:
