@@ -130,7 +130,7 @@ def calibrate(
 
     def require(condition: object, problem: str) -> None:
         if not condition:
-            raise UsageError(f"{place_map.path} cannot be calibrated and uses the default confidence model: {problem}.")
+            raise UsageError(f"{place_map.path} cannot be calibrated: {problem}.")
 
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)
