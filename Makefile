@@ -13,10 +13,10 @@ demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
 
 # On two cores, lint and documents beside the tests.
-test: $(VENV)/installed $(VENV)/clients/installed
+test: $(VENV)/installed
 	$(MAKE) --jobs 2 run-tests lint docs
 
-run-tests: $(VENV)/installed
+run-tests: $(VENV)/clients/installed $(VENV)/collected.txt
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 # What needs no process, no network and no clock: under a minute.
@@ -81,6 +81,10 @@ bench-arm64: $(VENV)/installed
 # Streams, pictures and maps that are damaged or say nothing, from a seed, into benchmarks/results/.
 hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
+
+# Compiles once what the tests import; otherwise the processes of the first run would each do it.
+$(VENV)/collected.txt: $(VENV)/installed
+	@$(BIN)/python -m pytest --collect-only -qq > $@ || true
 
 # Ground stations' programs for the tests, without what their windows need (1 GB). Where they cannot be had, their tests
 # are skipped.
