@@ -157,13 +157,11 @@ def test_replay_reports_missing_files(fly, recording, tmp_path, capsys):
     finish_flight(fly(*FAST_RATE, place_map=place_map))
     place_map.rename(tmp_path / "elsewhere.gpkg")
     assert "--map" in expect_refusal(capsys, "replay", log)
-    assert main(["replay", str(log), "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
     there = tmp_path / "there"
     there.mkdir()
     shutil.move(str(tmp_path / "recorded"), str(there))
     shutil.move(str(log), str(there))
     moved = str(there / log.name)
-    assert main(["replay", moved, "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
     (frame,) = (there / "recorded").glob("*/frames/000020.jpg")
     frame.write_bytes(frame.read_bytes()[:100])
     assert main(["replay", moved, "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
