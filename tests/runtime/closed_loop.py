@@ -53,14 +53,19 @@ class ClosedLoop:
         self.gyro_sd, self.show_tilt = 0.0, False
         self.away_m, self.error_m, self.sent = [], [], []
         self._clock, self._rng, self._steps = FakeClock(), np.random.default_rng(5), 0
-        self.navigator = Navigator(min_accuracy_m, _FRAME_S)
-        settings = LinkSettings(clock=self._clock, listener=self.navigator)
-        self.conversation = Conversation(settings, self._clock) if edgevpr else None
-        if self.conversation:
-            self.conversation.request_position()
-            self.conversation.requests.is_flying = True
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
+        self._min_accuracy_m, self.conversation = min_accuracy_m, None
+        if edgevpr:
+            self.start()
+
+    def start(self):
+        """Start edgevpr, or start it again in flight."""
+        self.navigator = Navigator(self._min_accuracy_m, _FRAME_S)
+        self.conversation = Conversation(LinkSettings(clock=self._clock, listener=self.navigator), self._clock)
+        self.conversation.request_position()
+        self.conversation.requests.is_flying = True
         self._waiting, self._last_frame = [], None
+        return self
 
     @property
     def now_s(self) -> float:

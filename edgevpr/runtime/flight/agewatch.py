@@ -31,13 +31,9 @@ _MIN_MATCHES = 4  # needed to estimate a delay
 # For a negative delay the deviation is multiplied by this factor, without a limit, because such delays are rare.
 _MAX_PRIOR_CHI2 = 30.0
 _NEGATIVE_FACTOR = 4.0
-# Differences between reported motion and matches, beyond the accuracy of the matches: of velocity, due to unknown wind
-# (m/s) and its random walk (m/s in one second), or with GPS; of heading, due to compass and mount, and its random walk.
+# Differences between reported motion and matches, beyond the accuracy of the matches: of velocity, see `VelocityError`;
+# of heading, due to compass and mount, and its random walk.
 _START_SD_M = 1e3
-_WIND_SD_M_S = 8.0
-_WIND_RANDOM_WALK_M_S = 0.5
-_GPS_SD_M_S = 0.2
-_GPS_RANDOM_WALK_M_S = 0.05
 _MATCH_SD_M = 1.5
 _HEADING_RANDOM_WALK_DEG = 0.3
 _DIRECTION_SD_DEG = 2.0
@@ -59,6 +55,21 @@ _MIN_PENDING_MATCHES = 8  # needed to accept another delay
 _PAST_CHI2_WEIGHT = 0.9  # of the matches before the last half minute
 _MIN_AGREEING = 2  # consecutive matches after which the old delay counts as confirmed
 _MAX_OUTLIERS = 3  # consecutive contradictions that no delay explains: then the reported motion is wrong
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityError:
+    """Error of a reported velocity: standard deviation (m/s), and random walk (m/s in one second)."""
+
+    sd_m_s: float
+    random_walk_m_s: float
+
+
+BY_GPS = VelocityError(0.2, 0.05)
+DEAD_RECKONED = VelocityError(8.0, 0.5)  # unknown wind
+# Accelerations rotated by the attitude of a PX4 that follows our positions: this attitude was wrong by up to five
+# degrees, in varying directions.
+FOLLOWING_US = VelocityError(8.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,9 +124,8 @@ class AgeWatch:
         """The delay to subtract, seconds; 0 if none is known."""
         return self._delay.s if self._delay and abs(self._delay.s) > 2 * self._delay.sd_s else 0.0
 
-    def add_motion(self, t_s: float, velocity_m_s: Doubles, heading_deg: float | None, has_gps: bool) -> None:
-        """Add the reported motion at `t_s`: velocity (2,), east and north, and heading of the aircraft. `has_gps`: the
-        velocity has the accuracy of GPS."""
+    def add_motion(self, t_s: float, velocity_m_s: Doubles, heading_deg: float | None, error: VelocityError) -> None:
+        """Add the reported motion at `t_s`: velocity (2,), east and north, with its error, and heading."""
         if self._motion and t_s <= self._motion[-1][0]:
             return
         if self._motion and t_s - self._motion[-1][0] > _MAX_MOTION_GAP_S:
@@ -124,14 +134,13 @@ class AgeWatch:
         heading_deg = math.nan if heading_deg is None else heading_deg
         east_m_s, north_m_s = map(float, velocity_m_s)
         east_m, north_m, growth_m2_s2 = 0.0, 0.0, 0.0
-        start_m2_s2 = (_GPS_SD_M_S if has_gps else _WIND_SD_M_S) ** 2
+        start_m2_s2 = error.sd_m_s**2
         if self._motion:
             last_s, east_m, north_m, last_heading_deg, last_east_m_s, last_north_m_s, _, last_m2_s2 = self._motion[-1]
             interval_s = t_s - last_s
             east_m += interval_s / 2 * (last_east_m_s + east_m_s)
             north_m += interval_s / 2 * (last_north_m_s + north_m_s)
-            random_walk_m_s = _GPS_RANDOM_WALK_M_S if has_gps else _WIND_RANDOM_WALK_M_S
-            growth_m2_s2 = interval_s * random_walk_m_s**2 + abs(start_m2_s2 - last_m2_s2)
+            growth_m2_s2 = interval_s * error.random_walk_m_s**2 + abs(start_m2_s2 - last_m2_s2)
             if math.isfinite(last_heading_deg):
                 heading_deg = last_heading_deg + float(wrap_deg(heading_deg - last_heading_deg))  # unwrapped
         self._motion.append((t_s, east_m, north_m, heading_deg, east_m_s, north_m_s, growth_m2_s2, start_m2_s2))

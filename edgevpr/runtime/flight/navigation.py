@@ -54,8 +54,9 @@ class Navigation:
     the autopilot's velocities (`DEAD_RECKONING`) or from accelerations (`INERTIAL`, `INERTIAL_PX4`). `map_sd_m` is the
     standard deviation, of one axis, of the error common to all fixes.
 
-    Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions: GPS
-    is then the position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS
+    Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions, also
+    from those sent before edgevpr was restarted: such a path starts only at a receiver or a match, and GPS is the
+    position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS
     contradicts our position, and no recent match proves it."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
@@ -100,15 +101,14 @@ class Navigation:
         several would soon reveal an error of the path."""
         return max(t_s - self._last_odometry_s, self._query_interval_s) <= _MAX_TRACKING_GAP_S
 
-    def add_report(self, vehicle: Vehicle, trusts_gps: bool = True, may_echo_ours: bool = False) -> None:
+    def add_report(self, vehicle: Vehicle, trusts_gps: bool = True) -> None:
         """Process a report from the autopilot; reports without velocity are ignored. With GPS, if `trusts_gps`, our
-        position is corrected by the autopilot's or, for an inertial path, by the receiver's. `may_echo_ours`: the
-        autopilot may have derived the reported position from ours."""
+        position is corrected by the autopilot's or, for an inertial path, by the receiver's."""
         if vehicle.velocity_m_s is None:
             return
         has_gps = is_gps_aided(vehicle) and trusts_gps
         if self._drift.is_inertial:
-            self._correct_by_receiver(vehicle, vehicle.gps if has_gps else None, may_echo_ours)
+            self._correct_by_receiver(vehicle, vehicle.gps if has_gps else None)
         else:
             self._correct_by_estimate(vehicle, has_gps)
 
@@ -132,13 +132,11 @@ class Navigation:
             sd_m = _GPS_CORRELATION_FACTOR * (vehicle.position_sd_m or _UNKNOWN_POSITION_SD_M)
             self._filter.correct_by_gps(offset_m, sd_m, velocity_m_s - point.velocity_m_s, _GPS_VELOCITY_SD_M_S)
 
-    def _correct_by_receiver(self, vehicle: Vehicle, receiver: Receiver | None, may_echo_ours: bool) -> None:
+    def _correct_by_receiver(self, vehicle: Vehicle, receiver: Receiver | None) -> None:
         """Correct an inertial path by a receiver (None: there is no trusted GPS)."""
         path, had_gps = self._valid_path, self.has_gps
         if path is None:
             self.has_gps = receiver is not None and self._start_at_receiver(receiver, vehicle.t_received_s)
-            if receiver is None and not may_echo_ours:
-                self._start_at_estimate(vehicle)
             return
         error = None if receiver is None else self._compare_receiver(path, receiver)
         if receiver is None or error is None:

@@ -15,7 +15,7 @@ from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.agewatch import AgeWatch
+from edgevpr.runtime.flight.agewatch import BY_GPS, DEAD_RECKONED, FOLLOWING_US, AgeWatch, VelocityError
 from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
@@ -27,7 +27,7 @@ from edgevpr.runtime.flight.measurements import (
     position_match,
 )
 from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
-from edgevpr.runtime.flight.output import INFLUENCE_S, Output, OutputWatch
+from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -87,7 +87,7 @@ class Navigator(Listener):
         self._autopilot_since_s = self._attitude_error_s = -math.inf
         self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
-        self._watch, self._sent_s = OutputWatch(), -math.inf
+        self._watch = OutputWatch()
         self._height_ratio, self._height_ratio_sd = 1.0, 0.0
         self._shared_sd_m = map_sd_m  # standard deviation of the error common to the last fixes
 
@@ -133,14 +133,12 @@ class Navigator(Listener):
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of position and velocity."""
         self._vehicle = vehicle
-        if is_gps_aided(vehicle) and vehicle.t_received_s - self._sent_s > INFLUENCE_S:
-            self._sent_s = -math.inf  # our positions no longer affect its estimate
         navigation = self._navigation
-        navigation.add_report(vehicle, self._trusts_gps, self._sent_s > -math.inf)
+        navigation.add_report(vehicle, self._trusts_gps)
         self._watch.update(vehicle, navigation.last_fix_s, navigation.has_gps)
         if navigation.path_velocity_m_s is not None:
-            has_gps = navigation.has_gps and not self._channel.is_continuous
-            self.age.add_motion(vehicle.t_received_s, navigation.path_velocity_m_s, vehicle.heading_deg, has_gps)
+            velocity_m_s, error = navigation.path_velocity_m_s, self._choose_velocity_error()
+            self.age.add_motion(vehicle.t_received_s, velocity_m_s, vehicle.heading_deg, error)
 
     def handle_specific_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s2 (forward, right, down), and the attitude."""
@@ -149,8 +147,9 @@ class Navigator(Listener):
         self._navigation.add_acceleration(t_s, acceleration_m_s2)
 
     def handle_frame(self, event: Recognition, is_query: bool = True) -> None:
-        """Process the frame of an event without an accepted match, or one that only provides odometry (not a query)."""
-        if frame := self._measure(event):
+        """Process the frame of an event without an accepted match, or one that only provides odometry (not a query).
+        Odometry between frames of unknown age is of an unknown time, so they are not used."""
+        if not self.age.is_unknown and (frame := self._measure(event)):
             self._navigation.add_frame(frame, is_query)
 
     def report_accuracy(self, event: Recognition) -> Recognition:
@@ -224,7 +223,6 @@ class Navigator(Listener):
         if estimate is None or vehicle is None or not self.output.is_sent:
             self._slew.reset()
             return None
-        self._sent_s = t_s
         self._watch.record_sent(t_s)
         lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
         east, north = estimate.velocity_m_s
@@ -266,6 +264,12 @@ class Navigator(Listener):
         if was_lost and receiver.steady_for_s < _GPS_BACK_UNTIL_S:
             return Output.GPS_BACK if receiver.steady_for_s >= _GPS_BACK_FROM_S else Output.SENDING
         return Output.RESERVE
+
+    def _choose_velocity_error(self) -> VelocityError:
+        has_gps, is_continuous = self._navigation.has_gps, self._channel.is_continuous
+        if self._channel in _PX4_CHANNELS and not has_gps:
+            return FOLLOWING_US
+        return BY_GPS if has_gps and not is_continuous else DEAD_RECKONED
 
     def _advise_without_report(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or has not reported it yet."""

@@ -16,6 +16,7 @@ from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.vehicle import Attitude
+from edgevpr.runtime.flight.agewatch import BY_GPS, DEAD_RECKONED, FOLLOWING_US
 from edgevpr.runtime.flight.consistency import PredictedFix
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4
 from edgevpr.runtime.flight.navigation import NavState
@@ -198,30 +199,31 @@ def test_px4_gets_uninflated_errors_while_images_show_its_attitude(channel, how,
     assert navigator.estimate_state(NOW_S).accuracy_m == pytest.approx(2.0 * factor)
 
 
-@pytest.mark.parametrize(
-    ("after_s", "reports", "is_ours"), [(10.0, GPS, True), (10.1, GPS, False), (10.1, {"has_gps": False}, True)]
-)
-def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
+def test_navigation_uses_only_a_trusted_gps():
     navigator = navigate(Channel.GPS_INPUT)
-    assert navigator._navigation.reports == [(True, False)]
-    navigator.estimate_state(NOW_S)
     navigator.trust_gps(False)
-    navigator.handle_vehicle(make_vehicle(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
-    assert navigator._navigation.reports[1:] == [(False, is_ours)]
+    navigator.handle_vehicle(make_vehicle(*HOME, NOW_S, velocity_m_s=(0.0, 0.0), **GPS))
+    assert navigator._navigation.reports == [(True,), (False,)]
 
 
 @pytest.mark.parametrize(
-    ("channel", "has_gps", "rests"),
-    [(Channel.COMMAND, True, True), (Channel.COMMAND, False, False), (Channel.GPS_INPUT, True, False)],
+    ("channel", "has_gps", "error"),
+    [
+        (Channel.COMMAND, True, BY_GPS),
+        (Channel.COMMAND, False, DEAD_RECKONED),
+        (Channel.GPS_INPUT, True, DEAD_RECKONED),
+        (Channel.SENSOR, True, DEAD_RECKONED),
+        (Channel.VISION, False, FOLLOWING_US),
+    ],
 )
-def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
+def test_age_of_pictures_is_found_by_the_path(channel, has_gps, error):
     navigator, motions = navigate(channel), []
     navigator.age = SimpleNamespace(add_motion=lambda *motion: motions.append(motion))
     vehicle = make_vehicle(*HOME, NOW_S, velocity_m_s=(0.0, 0.0))
     navigator.handle_vehicle(vehicle)
     navigator._navigation.has_gps, navigator._navigation.path_velocity_m_s = has_gps, (1.0, 2.0)
     navigator.handle_vehicle(vehicle)
-    assert motions == [(NOW_S, (1.0, 2.0), None, rests)]
+    assert motions == [(NOW_S, (1.0, 2.0), None, error)]
 
 
 def test_frame_claims_a_height_error_shown_by_images():
@@ -232,6 +234,8 @@ def test_frame_claims_a_height_error_shown_by_images():
     navigator.correct_height(1.0, 0.3)
     navigator.handle_frame(fake_match())
     navigator.handle_frame(fake_match(frame=None))
+    navigator.age.is_unknown = True
+    navigator.handle_frame(fake_match())
     frames = navigator._navigation.frames
     assert [frame.sd_m for frame, _ in frames] == pytest.approx([50 * FRAME_TIME_SD_S, 0.0, 50 * FRAME_TIME_SD_S])
     assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.2, 0.3])

@@ -119,7 +119,7 @@ class ReceiverOnly:
             gps = make_receiver(where, 1.0, self.t_s, **known) if has_gps else None
             estimate = offset_position(*HOME, estimate_m, 0.0)
             known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
-            self.navigation.add_report(make_vehicle(*estimate, self.t_s, **known), may_echo_ours=True)
+            self.navigation.add_report(make_vehicle(*estimate, self.t_s, **known))
         return self
 
     @property
