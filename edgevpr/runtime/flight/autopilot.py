@@ -30,7 +30,7 @@ _UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
 _MIN_REPORTED_DELAY_S = 0.3
 
 _SOURCE_SET_RETRY_S = 2.0  # between two requests for a source set, until one is answered
-_MIN_GPS_GOOD_S = 10.0  # GPS must be good for this long before the source set with GPS is requested again
+_MIN_GPS_GOOD_S = 3.0  # GPS must be good for this long before the source set with GPS is requested again
 
 _log = logging.getLogger(__name__)
 
@@ -256,7 +256,7 @@ class AutopilotOutput:
 
 class SourceSets:
     """Decides which source set to request from the autopilot: `no_gps` when GPS is lost or wrong and we know the
-    position, then `gps` once GPS has been good for ten seconds, each until it is answered. Unless both numbers are
+    position, then `gps` once GPS has been good for three seconds, each until it is answered. Unless both numbers are
     configured, none is requested."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
