@@ -33,6 +33,9 @@ from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
+# Nor is a continuous one with a larger error of velocity, as after a single match without GPS: of an aircraft at 13 m/s
+# it was soon 40 m behind, and since it does not jump, it took 15 s to catch up.
+_MAX_SPEED_ERROR_M_S = 3.0
 _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long after the last match, odometry or GPS
 # From accelerations alone we know no more than the autopilot, which has them too, and dead-reckons for some seconds
 # itself. So a continuous position ends this long after the last picture with a match or odometry or, until there is
@@ -292,6 +295,7 @@ class Navigator(Listener):
             # A channel used with GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
             is_gps_recent = self._channel.works_with_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
             is_known = t_s - last_vision_s <= _MAX_BLIND_S or is_gps_recent
+            is_known &= estimate.speed_accuracy_m_s <= _MAX_SPEED_ERROR_M_S
         else:
             is_known = t_s - max(last_vision_s, last_gps_s) <= _MAX_INTERIM_S
         return estimate if is_known else None
