@@ -181,8 +181,9 @@ class Navigator(Listener):
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
-            sd_m = compute_worst_sd(match.scatter_m2)
-            self._navigation.start_at_fix(match.position, sd_m, match.t_s, vehicle.t_received_s)
+            if self._navigation.path_velocity_m_s is None:  # otherwise the path began after this frame was taken
+                sd_m = compute_worst_sd(match.scatter_m2)
+                self._navigation.start_at_fix(match.position, sd_m, match.t_s, vehicle.t_received_s)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
         verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
         if verdict.reason:
