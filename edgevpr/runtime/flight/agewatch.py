@@ -31,10 +31,9 @@ _MIN_MATCHES = 4  # needed to estimate a delay
 # For a negative delay the deviation is multiplied by this factor, without a limit, because such delays are rare.
 _MAX_PRIOR_CHI2 = 30.0
 _NEGATIVE_FACTOR = 4.0
-# Differences between reported motion and matches, beyond the accuracy of the matches: of velocity, see `VelocityError`;
-# of heading, due to compass and mount, and its random walk.
 _START_SD_M = 1e3
 _MATCH_SD_M = 1.5
+# Of reported headings minus those of matches, due to compass and mount.
 _HEADING_RANDOM_WALK_DEG = 0.3
 _DIRECTION_SD_DEG = 2.0
 _HEADING_OFFSET_GAIN = 0.25
@@ -157,7 +156,9 @@ class AgeWatch:
     def judge(self, event: Recognition) -> None:
         """Process the accepted match of the frame that `correct` returned last. If `is_unknown` is True afterwards, the
         match must not be used."""
-        self._drop_old_matches()
+        from_s = self._motion[0][0] + DELAYS_S[-1] if self._motion else math.inf
+        self._matches = [match for match in self._matches if match.t_s >= from_s]
+        self._pending = [match for match in self._pending if match.t_s >= from_s][-_MAX_MATCHES:]
         match = self._make_match(event)
         if match is None:
             return
@@ -213,12 +214,6 @@ class AgeWatch:
         if is_clear and estimate.s > -_MAX_DELAY_CHANGE_S:
             self._matches, self._pending, self._delay, self.is_unknown = self._pending, [], estimate, False
             self._past_until_s, self._past_chi2 = -math.inf, np.zeros(len(DELAYS_S))
-
-    def _drop_old_matches(self) -> None:
-        """Drop matches older than the stored motion."""
-        from_s = self._motion[0][0] + DELAYS_S[-1] if self._motion else math.inf
-        self._matches = [match for match in self._matches if match.t_s >= from_s]
-        self._pending = [match for match in self._pending if match.t_s >= from_s][-_MAX_MATCHES:]
 
     def _make_match(self, event: Recognition) -> TimedMatch | None:
         """Return the match of an event; None if the motion at that time is not known."""

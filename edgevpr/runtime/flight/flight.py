@@ -97,7 +97,9 @@ class Flight:
             with io.stop.interrupt_start():
                 recogniser = open_map(config, io)
                 stack.callback(recogniser.place_map.close)
-                flight_log = stack.enter_context(_open_log(io))
+                log, clock, is_service = io.log, io.clock, systemd.is_service()
+                flight_log = FlightLog(log.path, clock.mono_s, clock.utc_s, retries=is_service, max_mb=log.max_mb)
+                stack.enter_context(flight_log)
             flight_log.write("start", **log_start(config, io, recogniser))
             step_s, settings, camera = 1 / io.board.rate_hz, config.mavlink, config.source
             navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, camera.gimbal)
@@ -280,11 +282,6 @@ class Flight:
         fixes = f", {parts.autopilot.summary}" if parts.autopilot else ""
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted{fixes}"
         _log.info("%s, %.3f mAh (%.3f mAh of it for recognition)", counts, totals["used_mah"], totals["marginal_mah"])
-
-
-def _open_log(io: FlightIO) -> FlightLog:
-    log, clock, is_service = io.log, io.clock, systemd.is_service()
-    return FlightLog(log.path, clock.mono_s, clock.utc_s, retries=is_service, max_mb=log.max_mb)
 
 
 def open_link(

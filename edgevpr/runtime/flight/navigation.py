@@ -120,7 +120,8 @@ class Navigation:
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_received_s
         path = self._valid_path
         if path is None:
-            self._start_at_estimate(vehicle)
+            position = Position(vehicle.lat_deg, vehicle.lon_deg)
+            self._start(position, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
             return
         self._filter.predict(path.add_velocity(t_s, velocity_m_s))
         if had_gps and not self.has_gps:
@@ -180,11 +181,6 @@ class Navigation:
         # In a turn, an error in the receiver's lag changes its velocity, which would look like an attitude error.
         sd_m_s = math.hypot(_GPS_VELOCITY_SD_M_S, *(point.velocity_m_s - before.velocity_m_s))
         return offset_m, sd_m, error_m_s, sd_m_s, path.now.t_s - measured_s
-
-    def _start_at_estimate(self, vehicle: Vehicle) -> None:
-        if vehicle.position_sd_m is not None:
-            position, velocity_m_s = Position(vehicle.lat_deg, vehicle.lon_deg), np.array(vehicle.velocity_m_s)
-            self._start(position, vehicle.position_sd_m, velocity_m_s, vehicle.t_received_s, self._drift.velocity_sd)
 
     def _start_at_receiver(self, receiver: Receiver, now_s: float) -> bool:
         """Start the path at a receiver's position if it is steady; return True if the path was started."""

@@ -124,9 +124,9 @@ class Belief:
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
             misses = predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
-            predicted[indices] = self._compute_mass_near(
-                replace(misses, weight=now.weight * now.confirmed), proposed.position
-            )
+            near = self._scale.near + _SAME_POSITION_SIGMAS * compute_mean_sd(misses.covariance)
+            is_near = compute_distances(proposed.position, misses.position) <= near
+            predicted[indices] = is_near @ (now.weight * now.confirmed)
             # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
             min_gain = (factor * odds * lost - float(misses.weight.sum())) / max(float(hits.weight.sum()), _MIN_WEIGHT)
             hits = replace(hits, weight=hits.weight * max(1.0, min_gain) ** staleness)
@@ -138,11 +138,6 @@ class Belief:
         self._now = replace(updated, weight=weight)[strongest[weight[strongest] > _MIN_WEIGHT]]
         self._lost = max(0.0, 1 - float(self._now.weight.sum()))
         return self._make_posterior(probability, predicted)
-
-    def _compute_mass_near(self, moved: Hypotheses, position: Doubles) -> Doubles:
-        """Return the weight (K,) of the hypotheses near each `position` (K, 2), allowing for their covariance."""
-        near = self._scale.near + _SAME_POSITION_SIGMAS * compute_mean_sd(moved.covariance)
-        return np.asarray((compute_distances(position, moved.position) <= near) @ moved.weight)
 
     def _apply_transitions(self) -> tuple[Hypotheses, float, float]:
         """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the

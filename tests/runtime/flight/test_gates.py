@@ -36,8 +36,8 @@ class KnownNavigation:
         self.off_m, self.accuracy_m, self.drift_m_s = off_m, accuracy_m, drift_m_s
         self.last_vision_s = self.last_fix_s = NOW_S - shown_ago_s
         self.last_gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
-        self.reports, self.frames, self.begun, self.contradicts_m = [], [], [], 0.0
-        self.add_acceleration = self.correct_by_fix = lambda *_: None
+        self.frames, self.begun, self.contradicts_m = [], [], 0.0
+        self.add_report = self.add_acceleration = self.correct_by_fix = lambda *_: None
 
     def estimate_state(self, t_s):
         if self.accuracy_m is None:
@@ -46,9 +46,6 @@ class KnownNavigation:
         return NavState(
             t_s=t_s, position=where, velocity_m_s=(3.0, 4.0), accuracy_m=self.accuracy_m, speed_accuracy_m_s=0.5
         )
-
-    def add_report(self, vehicle, *how):
-        self.reports.append(how)
 
     def add_frame(self, frame, is_query):
         self.frames.append((frame, is_query))
@@ -197,13 +194,6 @@ def test_px4_gets_uninflated_errors_while_images_show_its_attitude(channel, how,
         lean = AttitudeError((0.01, 0.0), 0.01)
         navigator.advise(make_match(Position(*HOME), NOW_S - shown_ago_s, None, 1.5, (1,), lean=lean), NOW_S)
     assert navigator.estimate_state(NOW_S).accuracy_m == pytest.approx(2.0 * factor)
-
-
-def test_navigation_uses_only_a_trusted_gps():
-    navigator = navigate(Channel.GPS_INPUT)
-    navigator.trust_gps(False)
-    navigator.handle_vehicle(make_vehicle(*HOME, NOW_S, velocity_m_s=(0.0, 0.0), **GPS))
-    assert navigator._navigation.reports == [(True,), (False,)]
 
 
 @pytest.mark.parametrize(
