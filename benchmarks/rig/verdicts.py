@@ -68,14 +68,10 @@ def compute_flight_figures(folder: Path, flight: Flight) -> Row:
             row["first_s"] = next((round(float(time_s - due_s), 1) for time_s in sent_s if time_s >= due_s), None)
         if event.silent_s is not None:
             row["sent_though_silent"] = int((sent_s >= began_s + event.silent_s).sum())
-        row["accepted"] = _count_accepted(folder)
+        # A restart begins a new log.
+        queries = [line for log in folder.glob("flight*.jsonl") for line in read_log(log) if line["kind"] == "query"]
+        row["accepted"] = f"{sum(query['accepted'] for query in queries)} of {len(queries)}"
     return row
-
-
-def _count_accepted(folder: Path) -> str:
-    """Return the text "accepted of all" queries, from all logs: a restart begins a new log."""
-    queries = [line for log in folder.glob("flight*.jsonl") for line in read_log(log) if line["kind"] == "query"]
-    return f"{sum(query['accepted'] for query in queries)} of {len(queries)}"
 
 
 def compute_distances(points_m: np.ndarray, path_m: list) -> np.ndarray:
