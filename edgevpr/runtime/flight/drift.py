@@ -36,6 +36,7 @@ _MAX_ROTATION_RAD = 0.3
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
 _SIZE = 12
 _EYE = np.eye(2)
+_SCALE = 10
 _TURN = 11
 _FRAME = np.zeros((2, _SIZE))  # measurement matrix of `f`
 _FIX = np.zeros((2, _SIZE))  # measurement matrix of a frame's fix
@@ -192,6 +193,11 @@ class DriftFilter:
             matrix = np.zeros((1, _SIZE))
             matrix[0, _TURN] = 1.0
             self._correct(matrix, np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]]))
+
+    def forget_odometry_scale(self) -> None:
+        """Restart the scale error of odometry, after a correction of the height that scales it."""
+        self._x[_SCALE] = self._p[_SCALE] = self._p[:, _SCALE] = 0.0
+        self._p[_SCALE, _SCALE] = _ODOMETRY_SD**2
 
     def correct_by_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by the fix of the last frame: its offset (2,) from the path and covariance (2, 2)."""

@@ -115,6 +115,8 @@ class Navigator(Listener):
         """Set the ratio of visual height to the autopilot's height above ground (1.0: equal). Odometry
         is scaled by it. The ground may change back at any time, so the claimed error contains the deviation from 1.0
         or `ratio_sd`, the relative error of the ratio, if that is larger."""
+        if ratio != self._height_ratio:  # fixes may have shown part of it as a scale error of odometry
+            self._navigation.forget_odometry_scale()
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
     def handle_channel(self, channel: Channel) -> None:
