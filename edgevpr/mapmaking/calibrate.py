@@ -91,8 +91,10 @@ def query_map(search: MapSearch, pictures: Iterable[tuple[int, LevelledImage]]) 
         if (slot := search.slots.get(place_id)) is None:
             continue
         same_ground = search.find_same_ground(slot)
-        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~same_ground)))
-        for way, original, candidates in (*ways, (MIRRORED, _mirror_picture(picture), index)):
+        mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
+        mirrored = LevelledImage(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
+        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~same_ground)), (MIRRORED, mirrored, index))
+        for way, original, candidates in ways:
             if not len(candidates):
                 continue
             image, mask = change_picture(original.image, rng, looks_down, original.mask)
@@ -266,8 +268,3 @@ def fit_logistic(
 def make_evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
     """Return the evidence of N matches as a matrix, float64 (N, F), with one column for each of the F `names`."""
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
-
-
-def _mirror_picture(picture: LevelledImage) -> LevelledImage:
-    mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
-    return LevelledImage(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)

@@ -66,8 +66,7 @@ class VelocityError:
 
 BY_GPS = VelocityError(0.2, 0.05)
 DEAD_RECKONED = VelocityError(8.0, 0.5)  # unknown wind
-# Accelerations rotated by the attitude of a PX4 that follows our positions: this attitude was wrong by up to five
-# degrees, in varying directions.
+# Accelerations rotated by the attitude of a PX4 that follows our positions: it was wrong by up to five degrees.
 FOLLOWING_US = VelocityError(8.0, 2.0)
 
 

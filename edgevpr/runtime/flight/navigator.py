@@ -33,8 +33,7 @@ from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
-# Nor is a continuous one with a larger error of velocity, as after a single match without GPS: of an aircraft at 13 m/s
-# it was soon 40 m behind, and since it does not jump, it took 15 s to catch up.
+# Nor is a continuous one of unknown velocity: at 13 m/s it fell 40 m behind, and took 15 s to catch up without a jump.
 _MAX_SPEED_ERROR_M_S = 3.0
 _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long after the last match, odometry or GPS
 # From accelerations alone we know no more than the autopilot, which has them too, and dead-reckons for some seconds

@@ -252,7 +252,9 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     figures = {"track_confidence": track, "confidence": reported, "min_confidence": needed, **evidence.describe()}
     is_confident = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
-    is_tracked = track is not None and _is_track_confident(track, confidence, needed, rule.precision)
+    raises_odds = track is not None and track * (1 - confidence) >= _MIN_ODDS_RATIO * confidence * (1 - track)
+    min_track = max(_MIN_TRACK_CONFIDENCE, min(needed, rule.precision) if raises_odds else needed)
+    is_tracked = track is not None and track >= min_track
     if not (is_confident or (is_tracked and (findings.predicted or 0.0) >= _MIN_PREDICTED)):
         code = rule.explain(evidence)
     elif evidence.lead < 0 and not is_confident:
@@ -262,13 +264,6 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     elif rotation_lead is not None and rotation_lead < _MIN_LEAD_OVER_OTHER_ROTATION:
         code = ReasonCode.ROTATION_AMBIGUOUS
     return Verdict(code is ReasonCode.ACCEPTED_BY_CONFIDENCE, Reason(code, figures))
-
-
-def _is_track_confident(track: float, confidence: float, needed: float, precision: float) -> bool:
-    """Return True if `track`, the probability of a place from the flight so far, is high enough. `confidence` is that
-    of its match alone, `needed` what a match alone needs, and `precision` that of the `ConfidenceRule`."""
-    raises_odds = track * (1 - confidence) >= _MIN_ODDS_RATIO * confidence * (1 - track)
-    return track >= max(_MIN_TRACK_CONFIDENCE, min(needed, precision) if raises_odds else needed)
 
 
 def _check_landmarks(agreement: Agreement, score: float) -> Reason | None:
