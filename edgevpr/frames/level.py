@@ -76,8 +76,8 @@ class View:
     (`recognise.relief` adds that due to the height of the ground). `zoom`: factor by which the image was enlarged: its
     longest side shows that many times less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for
     an image that was not warped because its lens is unknown. `focal`: focal length as a fraction of the longest side.
-    `rotation_deg`: clockwise rotation that was applied to the image.
-    `reason`: why a tilted image was not warped."""
+    `rotation_deg`: clockwise rotation that was applied to the image. `height_scale`: factor by which the height that
+    `footprint_m` was computed from had been corrected. `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -87,6 +87,7 @@ class View:
     nadir_offset_m: tuple[float, float] | None = None
     focal: float | None = None
     rotation_deg: float = 0.0
+    height_scale: float = 1.0
     reason: Reason | None = None
 
     @property
@@ -162,7 +163,7 @@ def level_image(
     if camera.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
         nadir_offset, focal = camera.nadir_offset(camera.straight, 1.0), camera.focal_px / camera.longest_px
         view = View(up_deg=camera.top_deg, footprint_m=image_m, nadir_offset=nadir_offset, focal=focal)
-        view = replace(view, nadir_offset_sd=camera.nadir_offset_sd(1.0))
+        view = replace(view, nadir_offset_sd=camera.nadir_offset_sd(1.0), height_scale=scale)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
     below &= camera.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
@@ -185,6 +186,7 @@ def level_image(
         zoom=zoom,
         focal=out_focal_px / side,
         rotation_deg=camera.top_deg or 0.0,
+        height_scale=scale,
         nadir_offset=(0.0, 0.0) if below and camera.is_tilt_known else camera.nadir_offset(out_from_lens, zoom),
         nadir_offset_sd=camera.nadir_offset_sd(zoom),
     )

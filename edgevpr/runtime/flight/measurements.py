@@ -98,11 +98,14 @@ def measure_frame(
         sd_m = compute_picture_error_m(vehicle, height_m, event.frame.t_sd_s, attitude_sd, sweep_m_s)
     is_unaffected = is_level or not has_attitude or not (event.view.nadir_offset or event.view.nadir_offset_m)
     can_scale = 1 / _MAX_HEIGHT_RATIO < height_ratio < _MAX_HEIGHT_RATIO
+    odometry = event.odometry if can_scale else None
+    if odometry and height_ratio != 1.0:  # otherwise the scale of the last match is the best
+        odometry = odometry.correct_height(height_ratio)
     return FrameMeasurement(
         t_s=event.frame.t_mono_s,
         sd_m=sd_m,
         attitude_gain_s2=0.0 if is_unaffected else height_m / GRAVITY_M_S2,
-        odometry=event.odometry.scale(height_ratio) if event.odometry and can_scale else None,
+        odometry=odometry,
         scale_sd=max(abs(height_ratio - 1.0), height_ratio_sd),
         correlation_length_m=_CORRELATION_LENGTH * (event.view.footprint_m or 0.0),
     )

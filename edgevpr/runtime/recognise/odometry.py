@@ -23,10 +23,10 @@ _MAX_ELAPSED_S = 30.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryStep:
-    """Motion from the frame at `from_s` to that at `to_s`: `moved_m` (east, north), correct if the height and heading
-    used for levelling are. `sd_m` is the standard deviation of each axis from the landmarks alone, of which `inliers`
-    agree. `zoom` is the natural logarithm of the ratio of the ground shown to that in the previous picture, beyond what
-    the heights explain: 0 over flat ground, positive over ground that falls away."""
+    """Motion from the frame at `from_s` to that at `to_s`: `moved_m` (east, north), correct if the heading is and the
+    height is `height_scale` times the reported one. `sd_m` is the standard deviation of each axis from the landmarks
+    alone, of which `inliers` agree. `zoom` is the natural logarithm of the ratio of the ground shown to that in the
+    previous picture, beyond what the heights explain: 0 over flat ground, positive over ground that falls away."""
 
     from_s: float
     to_s: float
@@ -34,11 +34,13 @@ class OdometryStep:
     sd_m: float
     inliers: int
     zoom: float = 0.0
+    height_scale: float = 1.0
 
-    def scale(self, factor: float) -> "OdometryStep":
-        """Return the motion if the pictures were taken from a height `factor` times as large."""
+    def correct_height(self, ratio: float) -> "OdometryStep":
+        """Return the motion if the pictures were taken from a height `ratio` times as large as the reported one."""
+        factor = ratio / self.height_scale
         east_m, north_m = self.moved_m
-        return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m)
+        return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m, height_scale=ratio)
 
     def fields(self) -> dict[str, Any]:
         """Return this step as fields of the flight log."""
@@ -84,4 +86,5 @@ class VisualOdometry:
             sd_m=start.footprint_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
             zoom=math.log(scale),
+            height_scale=start.height_scale,
         )

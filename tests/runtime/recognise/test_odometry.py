@@ -21,9 +21,9 @@ def ground():
     return draw_ground(400.0, 400.0)
 
 
-def take_view(ground, pose, told=None):
-    """The view from a pose, and its landmarks; `told` is the pose that the autopilot reports."""
-    picture = take_level_view(ground, pose, told)
+def take_view(ground, pose, told=None, scale=1.0):
+    """The view from a pose, and its landmarks; `told` and `scale` as in `take_level_view`."""
+    picture = take_level_view(ground, pose, told, scale)
     return picture.view, detect_landmarks(picture.image, picture.mask, QUERY_LANDMARKS)
 
 
@@ -57,6 +57,10 @@ def test_odometry_is_scaled_by_a_wrong_height_and_rotated_by_a_wrong_compass(gro
     low, turned = ({"height_m": 90.0}, {"heading_deg": 40.0})
     pair = [take_view(ground, pose, replace(pose, **low)) for pose in (START, second)]
     assert measure_odometry(*pair).moved_m == pytest.approx((27.0, 0.0), abs=0.7)
+    assert measure_odometry(*pair).correct_height(1 / 0.9).moved_m == pytest.approx((30.0, 0.0), abs=0.7)
+    corrected = measure_odometry(*(take_view(ground, pose, replace(pose, **low), 1 / 0.9) for pose in (START, second)))
+    assert corrected.moved_m == pytest.approx((30.0, 0.0), abs=0.7)
+    assert corrected.correct_height(1 / 0.9).moved_m == pytest.approx((30.0, 0.0), abs=0.7), "not twice"
     pair = [take_view(ground, pose, replace(pose, **turned)) for pose in (START, second)]
     east, north = measure_odometry(*pair).moved_m
     assert math.degrees(math.atan2(-north, east)) == pytest.approx(10.0, abs=1.0)
