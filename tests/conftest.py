@@ -39,7 +39,6 @@ LONGEST = (
     "test_demo",
     "test_profile_command",
     "test_interface",
-    "test_views",
 )
 
 

@@ -190,17 +190,14 @@ def read_key(path: str) -> bytes:
             mode, key = stat.S_IMODE(os.fstat(handle.fileno()).st_mode), handle.read(KEY_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"{path}: the signing key cannot be read ({error.strerror}): {_KEY_ADVICE}.") from error
-    if mode & 0o077 and not _is_credential(path, mode):
+    # systemd provides a credential to this service alone; its access list appears as a group permission.
+    folder = os.environ.get("CREDENTIALS_DIRECTORY")
+    is_credential = folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
+    if mode & 0o077 and not is_credential:
         raise ConfigError(f"{path}: other users can read the signing key (mode {mode:04o}): run `chmod 600 {path}`.")
     if len(key) != KEY_BYTES:
         raise ConfigError(f"{path}: a signing key must be {KEY_BYTES} bytes long, and this file is not: {_KEY_ADVICE}.")
     return key
-
-
-def _is_credential(path: str, mode: int) -> bool:
-    """Return True if systemd provides the file to this service alone; its access list appears as a group permission."""
-    folder = os.environ.get("CREDENTIALS_DIRECTORY")
-    return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 
 
 def _read_stamp(path: Path) -> int:

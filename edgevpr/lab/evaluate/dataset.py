@@ -129,7 +129,9 @@ def open_folder(folder: str | Path, within_m: float) -> Dataset:
         return load_dataset(query, ref, truth)
     for parent in (folder, folder / "test", folder / "images" / "test"):
         if (parent / "database").is_dir() and (parent / "queries").is_dir():
-            return _read_utm_names(parent / "queries", parent / "database", within_m)
+            folders = parent / "queries", parent / "database"
+            queries_m, references_m = ({path: _parse_utm_m(path) for path in list_images(each)} for each in folders)
+            return _match_near(*folders, queries_m, references_m, within_m)
     if query.is_dir() and ref.is_dir():
         return match_positions(query, ref, within_m)
     raise UsageError(f"{folder} does not have the layout of a data set: it needs {_LAYOUTS}.")
@@ -148,13 +150,6 @@ def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
     queries_m, references_m = (
         {path: offset_between_m(origin, position) for path, position in positions.items()}
         for positions in (queries, references)
-    )
-    return _match_near(query_dir, ref_dir, queries_m, references_m, within_m)
-
-
-def _read_utm_names(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
-    queries_m, references_m = (
-        {path: _parse_utm_m(path) for path in list_images(folder)} for folder in (query_dir, ref_dir)
     )
     return _match_near(query_dir, ref_dir, queries_m, references_m, within_m)
 

@@ -201,7 +201,6 @@ def test_px4_gets_uninflated_errors_while_images_show_its_attitude(channel, how,
     [
         (Channel.COMMAND, True, BY_GPS),
         (Channel.COMMAND, False, DEAD_RECKONED),
-        (Channel.GPS_INPUT, True, DEAD_RECKONED),
         (Channel.SENSOR, True, DEAD_RECKONED),
         (Channel.VISION, False, FOLLOWING_US),
     ],

@@ -20,9 +20,7 @@ def draw_ground(east_m: float, north_m: float) -> np.ndarray:
     return light_scene(make_scene(5, east_m, north_m, _METRES_PER_PIXEL), _LIGHT, 5)
 
 
-def take_level_view(
-    ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None, scale: float = 1.0
-) -> LevelledImage:
+def take_level_view(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None, scale=1.0) -> LevelledImage:
     """The levelled picture from a pose; `told` is the pose that the autopilot reports, `scale` corrects its height."""
     image = photograph(ground, _METRES_PER_PIXEL, pose, Camera(), _LIGHT, np.random.default_rng(1))
     names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")

@@ -157,8 +157,7 @@ def test_replay_reports_missing_files(fly, recording, tmp_path, capsys):
     finish_flight(fly(*FAST_RATE, place_map=place_map))
     place_map.rename(tmp_path / "elsewhere.gpkg")
     assert "--map" in expect_refusal(capsys, "replay", log)
-    there = tmp_path / "there"
-    there.mkdir()
+    (there := tmp_path / "there").mkdir()
     shutil.move(str(tmp_path / "recorded"), str(there))
     shutil.move(str(log), str(there))
     moved = str(there / log.name)
