@@ -194,10 +194,11 @@ class DriftFilter:
             matrix[0, _TURN] = 1.0
             self._correct(matrix, np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]]))
 
-    def forget_odometry_scale(self) -> None:
-        """Restart the scale error of odometry, after a correction of the height that scales it."""
-        self._x[_SCALE] = self._p[_SCALE] = self._p[:, _SCALE] = 0.0
-        self._p[_SCALE, _SCALE] = _ODOMETRY_SD**2
+    def restart_odometry_scale(self, error: float, tolerance: float) -> None:
+        """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""
+        if abs(self._x[_SCALE] - error) > tolerance:
+            self._p[_SCALE] = self._p[:, _SCALE] = 0.0
+            self._x[_SCALE], self._p[_SCALE, _SCALE] = error, _ODOMETRY_SD**2
 
     def correct_by_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by the fix of the last frame: its offset (2,) from the path and covariance (2, 2)."""

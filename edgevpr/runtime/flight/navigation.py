@@ -198,8 +198,8 @@ class Navigation:
     def _record_gps(self, now_s: float) -> None:
         self._last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix(now_s)
 
-    def forget_odometry_scale(self) -> None:
-        self._filter.forget_odometry_scale()
+    def restart_odometry_scale(self, error: float, tolerance: float = 0.0) -> None:
+        self._filter.restart_odometry_scale(error, tolerance)
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""

@@ -43,6 +43,8 @@ _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long aft
 _MAX_BLIND_S = 5.0
 _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
+# Between the height that a match shows, which varies by 0.1, and the scale error of odometry.
+_MAX_SCALE_DIFFERENCE = 0.15
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them carry the information of one, so the claimed error is multiplied by this. Without it, they outweighed
 # the gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute. A
@@ -115,7 +117,7 @@ class Navigator(Listener):
         is scaled by it. The ground may change back at any time, so the claimed error contains the deviation from 1.0
         or `ratio_sd`, the relative error of the ratio, if that is larger."""
         if ratio != self._height_ratio:  # fixes may have shown part of it as a scale error of odometry
-            self._navigation.forget_odometry_scale()
+            self._navigation.restart_odometry_scale(0.0)
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
     def handle_channel(self, channel: Channel) -> None:
@@ -180,6 +182,11 @@ class Navigator(Listener):
             return self._advise_without_report(fix, now_s)
         if vehicle.velocity_m_s is None:
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
+        reported, odometry, located = event.vehicle or vehicle, match.frame.odometry, event.located
+        if odometry and located and located.height_m and reported.height_m:
+            # GPS may have shown an error of scale over ground of another height.
+            error = located.height_m / (odometry.height_scale * reported.height_m) - 1.0
+            self._navigation.restart_odometry_scale(error, _MAX_SCALE_DIFFERENCE)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
             if self._navigation.path_velocity_m_s is None:  # otherwise the path began after this frame was taken

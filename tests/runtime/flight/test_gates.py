@@ -37,7 +37,7 @@ class KnownNavigation:
         self.last_vision_s = self.last_fix_s = NOW_S - shown_ago_s
         self.last_gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
         self.frames, self.begun, self.contradicts_m = [], [], 0.0
-        self.add_report = self.add_acceleration = self.correct_by_fix = self.forget_odometry_scale = lambda *_: None
+        self.add_report = self.add_acceleration = self.correct_by_fix = self.restart_odometry_scale = lambda *_: None
 
     def estimate_state(self, t_s):
         if self.accuracy_m is None:
