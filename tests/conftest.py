@@ -17,8 +17,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Files that take longest, most of them for a few tests that wait or start programs. They begin first: a process that
-# ended alone with one of them would leave the others idle.
+# Files that take longest. They begin first, so that no process ends alone with one of them.
 LONGEST = (
     "test_never_worse",
     "test_frames_damage",

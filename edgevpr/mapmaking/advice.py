@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Image, Singles
+from edgevpr.core.arrays import Image
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
@@ -106,7 +106,10 @@ def suggest_lens(pictures: FlightPictures, config: SourceConfig, technique: Tech
 @show_elapsed("checking where the camera points")
 def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -> None:
     """Log that the camera is assumed to face forward, and why. Raises UsageError if it clearly looks straight down."""
-    tilt_deg = _read_gimbal_tilt_deg(pictures.folder) if pictures.folder else None
+    runs = _choose_runs(pictures.folder) if pictures.folder else []
+    tags = [read_xmp(path) for run in runs for path in run]
+    tilts_deg = [max(abs(tag.roll_deg or 0.0), abs(tag.pitch_deg)) for tag in tags if tag.pitch_deg is not None]
+    tilt_deg = float(np.median(tilts_deg)) if tilts_deg else None
     if tilt_deg is not None and not _MAX_DOWN_DEG < tilt_deg < _MIN_FORWARD_DEG:
         is_down, why = tilt_deg <= _MAX_DOWN_DEG, f"XMP data: tilted {tilt_deg:.0f} degrees from straight down"
     else:
@@ -190,7 +193,9 @@ def measure_static_fraction(images: Iterable[Image], mask: OverlayMask | None) -
     count, allowed = 0, np.ones(_DISPLAY_SHAPE, bool)
     x, y, strength = np.zeros((3, *_DISPLAY_SHAPE), np.float32)
     for image in images:
-        dx, dy = _compute_gradients(image)
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = cv2.resize(grey.astype(np.float32), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_AREA)
+        dx, dy = (cv2.Sobel(grey, cv2.CV_32F, x_order, 1 - x_order, scale=1 / 8) for x_order in (1, 0))
         x, y, strength, count = x + dx, y + dy, strength + cv2.magnitude(dx, dy), count + 1
         if mask:
             shown = mask.fit_to(image).view(np.uint8)
@@ -200,14 +205,6 @@ def measure_static_fraction(images: Iterable[Image], mask: OverlayMask | None) -
     edges = allowed & (strength >= _MIN_EDGE * count)
     static = edges & (cv2.magnitude(x, y) >= _MIN_STATIC_FRACTION * strength)
     return None if static.sum() > _MAX_STATIC_EDGES * edges.sum() else float(static.mean())
-
-
-def _compute_gradients(image: Image) -> tuple[Singles, Singles]:
-    """Return the brightness gradients of a reduced copy of a picture, to the right and down: float32 (H, W) each."""
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    grey = cv2.resize(grey.astype(np.float32), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_AREA)
-    dx, dy = (cv2.Sobel(grey, cv2.CV_32F, x_order, 1 - x_order, scale=1 / 8) for x_order in (1, 0))
-    return np.asarray(dx, np.float32), np.asarray(dy, np.float32)
 
 
 def _open_video(uri: str) -> Source:
@@ -233,10 +230,3 @@ def _choose_runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:
         return [paths]
     starts = np.linspace(0, len(paths) - length, _RUN_COUNT).astype(int).tolist()
     return [paths[start : start + length] for start in starts]
-
-
-def _read_gimbal_tilt_deg(folder: Path) -> float | None:
-    """Return the tilt of a gimbal camera from straight down, from the XMP data of some pictures; None: unknown."""
-    tags = [read_xmp(path) for run in _choose_runs(folder) for path in run]
-    tilts_deg = [max(abs(tag.roll_deg or 0.0), abs(tag.pitch_deg)) for tag in tags if tag.pitch_deg is not None]
-    return float(np.median(tilts_deg)) if tilts_deg else None

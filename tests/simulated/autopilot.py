@@ -73,8 +73,7 @@ def run_autopilot(
 
 def serve(controller: FlightController, link_url: str, stop: threading.Event) -> AutopilotSummary:
     """Run this controller at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost; return what it
-    received. Raises LinkError if the link cannot be opened.
-    """
+    received. Raises LinkError if the link cannot be opened."""
     address = parse_link(link_url)
     try:
         port = open_port(address)

@@ -48,12 +48,7 @@ def test_make_gaussian_row_is_reproducible():
 
 @pytest.mark.parametrize("shape", [(15, 20), (13, 13), (20, 15), (7, 30), (2, 2), (4, 5)])
 def test_make_square_regions_equals_the_literal_loop(shape):
-    found = regions.make_square_regions(*shape)
-    assert found == literal.rmac_regions(*shape)
-    for top, left, side in found:
-        assert side >= 1
-        assert top + side <= shape[0]
-        assert left + side <= shape[1]
+    assert regions.make_square_regions(*shape) == literal.rmac_regions(*shape)
 
 
 def test_pool_squares_equals_the_literal_loop():

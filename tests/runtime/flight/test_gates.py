@@ -18,10 +18,11 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import BY_GPS, DEAD_RECKONED, FOLLOWING_US
 from edgevpr.runtime.flight.consistency import PredictedFix
-from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4
+from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4, DriftFilter
 from edgevpr.runtime.flight.navigation import NavState
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.output import Output
+from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
 
 NOW_S = 1000.0
@@ -213,6 +214,16 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, error):
     navigator._navigation.has_gps, navigator._navigation.path_velocity_m_s = has_gps, (1.0, 2.0)
     navigator.handle_vehicle(vehicle)
     assert motions == [(NOW_S, (1.0, 2.0), None, error)]
+
+
+@pytest.mark.parametrize(("height_m", "error"), [(132.0, 0.2), (120.0, 0.0)])
+def test_match_corrects_the_scale_that_gps_showed_over_other_ground(height_m, error):
+    navigator, filtered = navigate(), DriftFilter(INERTIAL, 1.0)
+    navigator._navigation.restart_odometry_scale = filtered.restart_odometry_scale
+    step = OdometryStep(from_s=NOW_S - 1, to_s=NOW_S, moved_m=(9.0, 0.0), sd_m=0.1, inliers=50, height_scale=1.1)
+    seen = fake_match(odometry=step, vehicle=make_vehicle(*HOME, NOW_S, height_m=100))
+    navigator.advise(replace(seen, located=replace(seen.located, height_m=height_m)), NOW_S)
+    assert filtered._x[10] == pytest.approx(error)
 
 
 def test_frame_claims_a_height_error_shown_by_images():

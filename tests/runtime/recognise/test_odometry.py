@@ -57,7 +57,6 @@ def test_odometry_is_scaled_by_a_wrong_height_and_rotated_by_a_wrong_compass(gro
     low, turned = ({"height_m": 90.0}, {"heading_deg": 40.0})
     pair = [take_view(ground, pose, replace(pose, **low)) for pose in (START, second)]
     assert measure_odometry(*pair).moved_m == pytest.approx((27.0, 0.0), abs=0.7)
-    assert measure_odometry(*pair).correct_height(1 / 0.9).moved_m == pytest.approx((30.0, 0.0), abs=0.7)
     corrected = measure_odometry(*(take_view(ground, pose, replace(pose, **low), 1 / 0.9) for pose in (START, second)))
     assert corrected.correct_height(1 / 0.9).moved_m == pytest.approx((30.0, 0.0), abs=0.7), "not twice"
     pair = [take_view(ground, pose, replace(pose, **turned)) for pose in (START, second)]
