@@ -91,8 +91,8 @@ def query_map(search: MapSearch, pictures: Iterable[tuple[int, LevelledImage]]) 
         if (slot := search.slots.get(place_id)) is None:
             continue
         same_ground = search.find_same_ground(slot)
-        mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
-        mirrored = LevelledImage(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
+        mirrored_mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
+        mirrored = LevelledImage(np.ascontiguousarray(picture.image[:, ::-1]), mirrored_mask, picture.view)
         ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~same_ground)), (MIRRORED, mirrored, index))
         for way, original, candidates in ways:
             if not len(candidates):

@@ -64,10 +64,10 @@ class VelocityError:
     random_walk_m_s: float
 
 
-BY_GPS = VelocityError(0.2, 0.05)
-DEAD_RECKONED = VelocityError(8.0, 0.5)  # unknown wind
+GPS_ERROR = VelocityError(0.2, 0.05)
+DEAD_RECKONING_ERROR = VelocityError(8.0, 0.5)  # unknown wind
 # Accelerations rotated by the attitude of a PX4 that follows our positions: it was wrong by up to five degrees.
-FOLLOWING_US = VelocityError(8.0, 2.0)
+PX4_INERTIAL_ERROR = VelocityError(8.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,6 +155,7 @@ class AgeWatch:
     def judge(self, event: Recognition) -> None:
         """Process the accepted match of the frame that `correct` returned last. If `is_unknown` is True afterwards, the
         match must not be used."""
+        # Matches older than the stored motion cannot be compared with it.
         from_s = self._motion[0][0] + DELAYS_S[-1] if self._motion else math.inf
         self._matches = [match for match in self._matches if match.t_s >= from_s]
         self._pending = [match for match in self._pending if match.t_s >= from_s][-_MAX_MATCHES:]

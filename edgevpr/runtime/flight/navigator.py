@@ -15,7 +15,7 @@ from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.agewatch import BY_GPS, DEAD_RECKONED, FOLLOWING_US, AgeWatch, VelocityError
+from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4_INERTIAL_ERROR, AgeWatch, VelocityError
 from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
@@ -280,8 +280,8 @@ class Navigator(Listener):
     def _choose_velocity_error(self) -> VelocityError:
         has_gps, is_continuous = self._navigation.has_gps, self._channel.is_continuous
         if self._channel in _PX4_CHANNELS and not has_gps:
-            return FOLLOWING_US
-        return BY_GPS if has_gps and not is_continuous else DEAD_RECKONED
+            return PX4_INERTIAL_ERROR
+        return GPS_ERROR if has_gps and not is_continuous else DEAD_RECKONING_ERROR
 
     def _advise_without_report(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or has not reported it yet."""

@@ -16,7 +16,7 @@ from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.agewatch import BY_GPS, DEAD_RECKONED, FOLLOWING_US
+from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4_INERTIAL_ERROR
 from edgevpr.runtime.flight.consistency import PredictedFix
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4, DriftFilter
 from edgevpr.runtime.flight.navigation import NavState
@@ -200,10 +200,10 @@ def test_px4_gets_uninflated_errors_while_images_show_its_attitude(channel, how,
 @pytest.mark.parametrize(
     ("channel", "has_gps", "error"),
     [
-        (Channel.COMMAND, True, BY_GPS),
-        (Channel.COMMAND, False, DEAD_RECKONED),
-        (Channel.SENSOR, True, DEAD_RECKONED),
-        (Channel.VISION, False, FOLLOWING_US),
+        (Channel.COMMAND, True, GPS_ERROR),
+        (Channel.COMMAND, False, DEAD_RECKONING_ERROR),
+        (Channel.SENSOR, True, DEAD_RECKONING_ERROR),
+        (Channel.VISION, False, PX4_INERTIAL_ERROR),
     ],
 )
 def test_age_of_pictures_is_found_by_the_path(channel, has_gps, error):
