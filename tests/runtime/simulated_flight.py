@@ -148,9 +148,8 @@ class SimFlight:
                 self._take_frame(self.step, self.vehicle, is_query=False)
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
                 self._take_query(*self.waiting.popleft())
-            if self.t_s >= self.between_due_s and (fix := self.navigator.make_interim_fix(self.t_s)):
-                self.between.append((fix, self.measure_error(fix.lat_deg, fix.lon_deg)))
-                self.apply_fix(fix)
+            if self.step % _STATE_STEPS == 0 and self.t_s >= self.between_due_s:
+                self._take_interim_fix(self.navigator.make_interim_fix(self.t_s))
             if self.step % 50 == 0:
                 self.errors_m.append(self.off_m)
         return self
@@ -202,6 +201,11 @@ class SimFlight:
         if self.takes_fixes:
             self.off_m = self.measure_error(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
             self.known = fix.accuracy_m, self.t_s
+
+    def _take_interim_fix(self, fix: Fix | None) -> None:
+        if fix:
+            self.between.append((fix, self.measure_error(fix.lat_deg, fix.lon_deg)))
+            self.apply_fix(fix)
 
     def places(self, step: int) -> tuple[int, ...]:
         """The places that a match of that step is of."""

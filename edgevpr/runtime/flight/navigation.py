@@ -198,7 +198,7 @@ class Navigation:
     def _record_gps(self, now_s: float) -> None:
         self._last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix(now_s)
 
-    def restart_odometry_scale(self, error: float, tolerance: float = 0.0) -> None:
+    def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         self._filter.restart_odometry_scale(error, tolerance)
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:

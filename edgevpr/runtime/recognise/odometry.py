@@ -5,7 +5,7 @@ point below the camera is known in each. No map is needed. It works only for cam
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from edgevpr.core.geodesy import picture_axes, wrap_deg
@@ -23,10 +23,11 @@ _MAX_ELAPSED_S = 30.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryStep:
-    """Motion from the frame at `from_s` to that at `to_s`: `moved_m` (east, north), correct if the heading is and the
-    height is `height_scale` times the reported one. `sd_m` is the standard deviation of each axis from the landmarks
-    alone, of which `inliers` agree. `zoom` is the natural logarithm of the ratio of the ground shown to that in the
-    previous picture, beyond what the heights explain: 0 over flat ground, positive over ground that falls away."""
+    """Motion from the frame at `from_s` to that at `to_s`: `moved_m` (east, north), correct if the reported heading and
+    height are. `sd_m` is the standard deviation of each axis from the landmarks alone, of which `inliers` agree. `zoom`
+    is the natural logarithm of the ratio of the ground shown to that in the previous picture, beyond what the heights
+    explain: 0 over flat ground, positive over ground that falls away. `height_ratio`: height above the ground that the
+    last match showed, divided by the reported one."""
 
     from_s: float
     to_s: float
@@ -34,13 +35,7 @@ class OdometryStep:
     sd_m: float
     inliers: int
     zoom: float = 0.0
-    height_scale: float = 1.0
-
-    def correct_height(self, ratio: float) -> "OdometryStep":
-        """Return the motion if the pictures were taken from a height `ratio` times as large as the reported one."""
-        factor = ratio / self.height_scale
-        east_m, north_m = self.moved_m
-        return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m, height_scale=ratio)
+    height_ratio: float = 1.0
 
     def fields(self) -> dict[str, Any]:
         """Return this step as fields of the flight log."""
@@ -55,8 +50,9 @@ class VisualOdometry:
     def __init__(self) -> None:
         self._previous: tuple[float, View, Landmarks] | None = None
 
-    def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
-        """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
+    def measure(self, t_s: float, view: View, landmarks: Landmarks, height_ratio: float) -> OdometryStep | None:
+        """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured.
+        `height_ratio`: as in `OdometryStep`."""
         last, self._previous = self._previous, (t_s, view, landmarks.select_best(PLACE_LANDMARKS))
         if last is None or not 0 < t_s - last[0] <= _MAX_ELAPSED_S:
             return None
@@ -71,20 +67,21 @@ class VisualOdometry:
         if agreement.shift_share is None or agreement.rotation_deg is None or agreement.scale is None:
             return None
         rotation_deg = wrap_deg(agreement.rotation_deg - (view.up_deg - start.up_deg))
-        scale = agreement.scale * start.footprint_m / view.footprint_m
+        start_m, footprint_m = start.footprint_m / start.height_scale, view.footprint_m / view.height_scale
+        scale = agreement.scale * start_m / footprint_m
         if abs(rotation_deg) > _MAX_TURN_DEG or not 1 / _MAX_SCALE < scale < _MAX_SCALE:
             return None
         # The point below the camera in the previous picture is that of this picture, rotated, scaled and shifted.
         factor = agreement.scale * complex(math.cos(turn := math.radians(agreement.rotation_deg)), math.sin(turn))
         step = factor * complex(view.nadir_offset[0], -view.nadir_offset[1]) + complex(*agreement.shift_share)
         step -= complex(start.nadir_offset[0], -start.nadir_offset[1])
-        east_m, north_m = start.footprint_m * picture_axes(start.up_deg) @ (step.real, -step.imag)
+        east_m, north_m = start_m * picture_axes(start.up_deg) @ (step.real, -step.imag)
         return OdometryStep(
             from_s=from_s,
             to_s=t_s,
             moved_m=(float(east_m), float(north_m)),
-            sd_m=start.footprint_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
+            sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
             zoom=math.log(scale),
-            height_scale=start.height_scale,
+            height_ratio=height_ratio,
         )

@@ -187,7 +187,7 @@ class Recogniser:
         if self._odometry is None or not view.is_georeferenced:
             return None
         with self.meter.step("odometry"):
-            return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks)
+            return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks, self._prior.height_ratio)
 
     def _decide(self, query: EncodedFrame, verifier: Verifier, odometry_step: OdometryStep | None) -> Decision:
         """Search the map for an encoded frame, and update the hints for the next query with the decision."""

@@ -22,7 +22,6 @@ from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4,
 from edgevpr.runtime.flight.navigation import NavState
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.output import Output
-from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
 
 NOW_S = 1000.0
@@ -94,6 +93,8 @@ GPS = {"has_gps": True}
         (Channel.COMMAND, {"shown_ago_s": 60.1}, False),
         (Channel.COMMAND, {"shown_ago_s": NEVER_S, "gps_ago_s": 60.0}, True),
         (Channel.COMMAND, {"shown_ago_s": NEVER_S, "gps_ago_s": 60.1}, False),
+        (Channel.GPS_INPUT, {"accuracy_m": 25.0}, True),
+        (Channel.VISION, {"accuracy_m": 25.1}, False),
         (Channel.GPS_INPUT, {"shown_ago_s": 5.0}, True),
         (Channel.GPS_INPUT, {"shown_ago_s": 5.1}, False),
         (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.0}, True),
@@ -216,12 +217,15 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, error):
     assert motions == [(NOW_S, (1.0, 2.0), None, error)]
 
 
-@pytest.mark.parametrize(("height_m", "error"), [(132.0, 0.2), (120.0, 0.0)])
-def test_match_corrects_the_scale_that_gps_showed_over_other_ground(height_m, error):
+@pytest.mark.parametrize(
+    ("height_m", "median_ratio", "error"),
+    [(132.0, 1.0, 0.32), (112.0, 1.0, 0.0), (112.0, 1.12, 0.12), (137.0, 1.34, 0.34), (210.0, 1.0, 0.0)],
+)
+def test_heights_of_matches_correct_the_scale_of_odometry(height_m, median_ratio, error):
     navigator, filtered = navigate(), DriftFilter(INERTIAL, 1.0)
     navigator._navigation.restart_odometry_scale = filtered.restart_odometry_scale
-    step = OdometryStep(from_s=NOW_S - 1, to_s=NOW_S, moved_m=(9.0, 0.0), sd_m=0.1, inliers=50, height_scale=1.1)
-    seen = fake_match(odometry=step, vehicle=make_vehicle(*HOME, NOW_S, height_m=100))
+    navigator.correct_height(median_ratio)
+    seen = fake_match(vehicle=make_vehicle(*HOME, NOW_S, height_m=100))
     navigator.advise(replace(seen, located=replace(seen.located, height_m=height_m)), NOW_S)
     assert filtered._x[10] == pytest.approx(error)
 
@@ -238,7 +242,7 @@ def test_frame_claims_a_height_error_shown_by_images():
     navigator.handle_frame(fake_match())
     frames = navigator._navigation.frames
     assert [frame.sd_m for frame, _ in frames] == pytest.approx([50 * FRAME_TIME_SD_S, 0.0, 50 * FRAME_TIME_SD_S])
-    assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.2, 0.3])
+    assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.24, 0.3])
     assert [is_query for _, is_query in frames] == [True, False, True]
 
 
