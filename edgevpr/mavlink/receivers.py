@@ -15,8 +15,8 @@ GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
 GPS_TIMEOUT_S = 2.5  # reports arrive at least once a second, and one may be lost
 DEFAULT_GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
 MAX_PLAUSIBLE_SD_M = 15.0  # a receiver with a larger standard deviation does not replace our positions
-# Time from a receiver's measurement to the arrival of its report: almost zero in PX4's simulator; in ArduPilot's, 0.1 s
-# plus up to 0.2 s until the next report.
+# Time from a receiver's measurement to the timestamp of its report: 0.1 s in ArduPilot's simulator. PX4's timestamps
+# are UTC, so its reports count from their arrival; in its simulator they have almost no lag.
 RECEIVER_LAG_S = 0.1
 _ACCURACY_UNKNOWN = (0, 2**32 - 1)  # values of h_acc: not sent, and unknown
 _SPEED_UNKNOWN = 2**16 - 1
@@ -40,8 +40,8 @@ class Receivers:
     def __init__(self) -> None:
         self._tracked: dict[str, _TrackedReceiver] = {}
 
-    def handle(self, message: Message, now_s: float) -> None:
-        """Process a GPS_RAW_INT or GPS2_RAW received from the autopilot at `now_s`."""
+    def handle(self, message: Message, t_s: float) -> None:
+        """Process a GPS_RAW_INT or GPS2_RAW of time `t_s` from the autopilot."""
         name = message.get_type()
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._tracked.pop(name, None)
@@ -50,10 +50,10 @@ class Receivers:
         # After a receiver is lost, its last position is still reported for some seconds, with an unchanged timestamp.
         if previous and message.time_usec and message.time_usec == previous.time_usec:
             return
-        report = _to_receiver(message, now_s)
+        report = _to_receiver(message, t_s)
         is_plausible = report.sd_m <= MAX_PLAUSIBLE_SD_M
         is_steady = previous is not None and is_plausible and _is_continuous(previous.report, report)
-        since_s = previous.steady_since_s if previous and is_steady else now_s
+        since_s = previous.steady_since_s if previous and is_steady else t_s
         self._tracked[name] = _TrackedReceiver(report, message.time_usec, since_s)
 
     def choose_best(self, now_s: float, own: str | None = None) -> Receiver | None:
@@ -75,12 +75,12 @@ def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float
     return offset_position(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
 
 
-def _to_receiver(message: Message, now_s: float) -> Receiver:
+def _to_receiver(message: Message, t_s: float) -> Receiver:
     return Receiver(
         lat_deg=message.lat / 1e7,
         lon_deg=message.lon / 1e7,
         sd_m=DEFAULT_GPS_SD_M if message.h_acc in _ACCURACY_UNKNOWN else message.h_acc / 1e3,
-        t_s=now_s,
+        t_s=t_s,
         velocity_m_s=_read_velocity(message),
         alt_m=message.alt / 1e3,
     )

@@ -98,6 +98,17 @@ def test_boot_time_s_uses_the_shortest_round_trip_of_ten_seconds():
     assert AutopilotClock().boot_time_s(1.0) is None
 
 
+@pytest.mark.parametrize(("age_s", "counted_s"), [(0.2, 0.2), (1.1, 0.0), (-0.1, 0.0), (-1.7e9, 0.0)])
+def test_report_of_a_receiver_counts_from_its_boot_time(age_s, counted_s):
+    autopilot = make_autopilot(Channel.COMMAND)
+    where = 500_000_000, 80_000_000, 300_000, 100, 100, 1000, 0, 10
+    autopilot.send(mavlink.MAVLink_gps_raw_int_message(round(1e6 * (autopilot.boot_s - age_s)), 3, *where, h_acc=500))
+    now_s = autopilot.clock.now_s
+    report = autopilot.conversation.autopilot.receivers.choose_best(now_s)
+    assert report.t_s == pytest.approx(now_s - counted_s, abs=0.01)
+    assert AutopilotClock().sent_s(1.0, now_s) == now_s, "unknown"
+
+
 def test_handle_ignores_an_unrequested_answer():
     clock = AutopilotClock()
     request = clock.make_request(1000.0)

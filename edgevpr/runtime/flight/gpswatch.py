@@ -10,8 +10,9 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.receivers import extrapolate
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
-from edgevpr.runtime.flight.measurements import PositionedMatch, compute_worst_sd, measure_for_gps
+from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps
 from edgevpr.runtime.flight.notifier import Notifier
+from edgevpr.runtime.recognise.locate import compute_worst_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # In combined standard deviations of match and receiver: correct ones differ by more in one flight of 3000. Map and

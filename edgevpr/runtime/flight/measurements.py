@@ -23,7 +23,6 @@ ATTITUDE_SD = math.tan(math.radians(0.5))
 RECEIVER_LAG_SD_S = 0.1  # standard deviation of a receiver's lag, whose mean is `receivers.RECEIVER_LAG_S`
 _UNKNOWN_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
 _UNKNOWN_SPEED_M_S = 15.0  # assumed if the aircraft reports none
-MAX_HEIGHT_RATIO = 2.0  # beyond it, odometry is discarded instead of scaled
 _CORRELATION_LENGTH = 0.25  # of the footprint: closer fixes have common errors due to changed ground
 _MAX_HEADING_CHANGE_DEG = 45.0  # largest change of the compass error between two fixes
 
@@ -97,12 +96,11 @@ def measure_frame(
         attitude_sd = ATTITUDE_SD if has_attitude else _UNKNOWN_ATTITUDE_SD
         sd_m = compute_picture_error_m(vehicle, height_m, event.frame.t_sd_s, attitude_sd, sweep_m_s)
     is_unaffected = is_level or not has_attitude or not (event.view.nadir_offset or event.view.nadir_offset_m)
-    can_scale = 1 / MAX_HEIGHT_RATIO < height_ratio < MAX_HEIGHT_RATIO
     return FrameMeasurement(
         t_s=event.frame.t_mono_s,
         sd_m=sd_m,
         attitude_gain_s2=0.0 if is_unaffected else height_m / GRAVITY_M_S2,
-        odometry=event.odometry if can_scale else None,
+        odometry=event.odometry,
         scale_sd=height_ratio * max(abs(height_ratio - 1.0), height_ratio_sd),
         correlation_length_m=_CORRELATION_LENGTH * (event.view.footprint_m or 0.0),
     )
@@ -161,9 +159,3 @@ def position_match(event: Recognition, frame: FrameMeasurement) -> PositionedMat
         attitude_error=event.located.attitude_error,
         heading_error_deg=heading_error_deg,
     )
-
-
-def compute_worst_sd(covariance: Doubles) -> float:
-    """Return the standard deviation along the worst direction of a covariance (2, 2)."""
-    (var_east, cov), (_, var_north) = covariance.tolist()
-    return math.sqrt((var_east + var_north) / 2 + math.hypot((var_east - var_north) / 2, cov))

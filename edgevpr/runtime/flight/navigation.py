@@ -11,10 +11,10 @@ from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
-from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, compute_worst_sd
+from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
-from edgevpr.runtime.recognise.locate import mahalanobis
+from edgevpr.runtime.recognise.locate import compute_worst_sd, mahalanobis
 
 _GPS_INTERVAL_S = 1.0
 _MAX_GPS_AGE_S = 0.7  # receivers report five times a second; without new reports the autopilot dead-reckons

@@ -19,11 +19,9 @@ from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4
 from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
-    MAX_HEIGHT_RATIO,
     FrameMeasurement,
     compute_reported_accuracy_m,
     compute_time_error_m,
-    compute_worst_sd,
     measure_frame,
     position_match,
 )
@@ -31,11 +29,11 @@ from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
 from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
+from edgevpr.runtime.recognise.locate import compute_worst_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
-# An ArduPilot plane follows continuous positions however large the claimed error: over unmapped ground 1.4 times as far
-# below, it strayed 84 m until they ended at 50 m, 41 m alone.
+# An ArduPilot plane follows positions of any claimed error: over ground 1.4 times as far below it strayed 84 m.
 _MAX_CONTINUOUS_ERROR_M = 25.0
 # Nor is a continuous one of unknown velocity: at 13 m/s it fell 40 m behind, and took 15 s to catch up without a jump.
 _MAX_SPEED_ERROR_M_S = 3.0
@@ -122,7 +120,7 @@ class Navigator(Listener):
         by it. The ground may change back at any time, so the claimed error contains the deviation from 1.0 or
         `ratio_sd`, the relative error of the ratio, if that is larger."""
         if ratio != 1.0:
-            self._correct_odometry_scale(ratio, _SCALE_TOLERANCE)
+            self._navigation.restart_odometry_scale(ratio - 1.0, _SCALE_TOLERANCE)
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
     def handle_channel(self, channel: Channel) -> None:
@@ -189,7 +187,8 @@ class Navigator(Listener):
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
         reported, located = event.vehicle or vehicle, event.located
         if located and located.height_m and reported.height_m:
-            self._correct_odometry_scale(located.height_m / reported.height_m, _MATCH_SCALE_TOLERANCE)
+            error = located.height_m / reported.height_m - 1.0
+            self._navigation.restart_odometry_scale(error, _MATCH_SCALE_TOLERANCE)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
             if self._navigation.path_velocity_m_s is None:  # otherwise the path began after this frame was taken
@@ -279,10 +278,6 @@ class Navigator(Listener):
         if was_lost and receiver.steady_for_s < _GPS_BACK_UNTIL_S:
             return Output.GPS_BACK if receiver.steady_for_s >= _GPS_BACK_FROM_S else Output.SENDING
         return Output.RESERVE
-
-    def _correct_odometry_scale(self, height_ratio: float, tolerance: float) -> None:
-        if 1 / MAX_HEIGHT_RATIO < height_ratio < MAX_HEIGHT_RATIO:
-            self._navigation.restart_odometry_scale(height_ratio - 1.0, tolerance)
 
     def _choose_velocity_error(self) -> VelocityError:
         has_gps, is_continuous = self._navigation.has_gps, self._channel.is_continuous

@@ -59,9 +59,7 @@ class Located:
     @property
     def accuracy_m(self) -> float:
         """Standard deviation along the worst direction, metres."""
-        var_east, cov, var_north = self.covariance_m2
-        mean, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
-        return math.sqrt(mean + half)
+        return compute_worst_sd(covariance_matrix(self.covariance_m2))
 
     @property
     def sd_m(self) -> float:
@@ -166,6 +164,12 @@ def add_tilt_covariance(located: Located, tilt: ObservedTilt, view: View) -> Loc
 def covariance_matrix(covariance: Covariance) -> Doubles:
     """Return a covariance (variance, covariance, variance) as a matrix (2, 2)."""
     return np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
+
+
+def compute_worst_sd(covariance: Doubles) -> float:
+    """Return the standard deviation along the worst direction of a covariance (2, 2)."""
+    (var_east, cov), (_, var_north) = covariance.tolist()
+    return math.sqrt((var_east + var_north) / 2 + math.hypot((var_east - var_north) / 2, cov))
 
 
 def mahalanobis(step: Doubles, covariance: Doubles) -> float:
