@@ -17,26 +17,20 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Files that take longest. They begin first, so that no process ends alone with one of them.
+# Files that take long and would come late. They begin first, so that no process ends alone with one of them.
 LONGEST = (
     "test_never_worse",
-    "test_frames_damage",
     "test_navigator",
     "test_flight_process",
     "test_feedback",
     "test_gate",
-    "test_frames_live",
     "test_replay",
     "test_survey",
     "test_levelling",
     "test_agewatch",
     "test_odometry_gaps",
-    "test_orthophoto_commands",
-    "test_map_calibration",
     "test_ground_stations",
     "test_memory",
-    "test_demo",
-    "test_profile_command",
     "test_interface",
 )
 

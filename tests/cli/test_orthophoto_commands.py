@@ -39,9 +39,9 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
         places = list(opened.read_places())
     assert all(place.heading_deg == 0 and place.source_image.startswith("valley.tif_r0") for place in places)
 
-    over = ("--orthophoto", ground, "--track", track, "--height-m", 77, "--every-m", 20)
+    over = ("--orthophoto", ground, "--track", track, "--height-m", 77, "--every-m", 40)
     assert run("simulate", "flight", flight, *over) == 0
-    assert "8 images" in capsys.readouterr().out
+    assert "4 images" in capsys.readouterr().out
     found = run_json(capsys, "match", place_map, "--images", flight / "images")
     taken = read_positions(flight / "positions.csv")
     off_m = []
@@ -51,9 +51,9 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
         if fix:
             away_m = distance_m(at.lat_deg, at.lon_deg, fix["lat_deg"], fix["lon_deg"])
             assert away_m == pytest.approx(query["from_gps_tag_m"], abs=0.01)
-            assert away_m < 3, "places are 20 m apart: it is the fix, and not the place"
+            assert away_m < 3, "places are 25 m apart: it is the fix, and not the place"
             assert not fix["of_place"]
-    assert sum(query["accepted"] for query in found) >= 6
+    assert sum(query["accepted"] for query in found) >= 3
     assert np.median(off_m) < 25
     assert max(off_m) < 50
 

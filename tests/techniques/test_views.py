@@ -31,10 +31,7 @@ def test_decode_hypothesis_gives_a_height_and_a_rotation():
     assert nearest == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
 
 
-@pytest.mark.parametrize(
-    ("height_ratio", "rotation_deg"),
-    [(0.5, 0), (0.6, 130), (0.84, 0), (1.0, 130), (1.42, 0), (2.0, 130)],
-)
+@pytest.mark.parametrize(("height_ratio", "rotation_deg"), [(0.5, 0), (0.6, 130), (1.42, 0), (2.0, 130)])
 def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_shift(town, height_ratio, rotation_deg):
     technique, places, rows = town
     query = technique.encode(draw_view(3, height_ratio, rotation_deg, right_px=24))

@@ -17,7 +17,7 @@ GOOD_SD = 0.0  # of gyros: a root second; PX4's simulator has the latter
 SIM_SD = math.radians(0.57)
 
 
-def hover(min_accuracy_m, gyro_sd, show_tilt, seconds=120):
+def hover(min_accuracy_m, gyro_sd, show_tilt, seconds=80):
     """Return how far a copter is from its target, step by step, while it hovers by our positions alone."""
     flight = ClosedLoop("px4-copter", min_accuracy_m=min_accuracy_m, EKF2_AGP0_CTRL=1).fly(40)
     flight.gyro_sd, flight.show_tilt = gyro_sd, show_tilt

@@ -99,7 +99,6 @@ GPS = {"has_gps": True}
         (Channel.GPS_INPUT, {"shown_ago_s": 5.1}, False),
         (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.0}, True),
         (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.1}, False),
-        (Channel.SENSOR, {"shown_ago_s": 5.0}, True),
         (Channel.VISION, {"shown_ago_s": 5.1}, False),
         (Channel.SENSOR, {"shown_ago_s": NEVER_S, "gps_ago_s": 0.0}, False),
     ],

@@ -246,7 +246,6 @@ def mislead(law, flight):
     "law",
     [
         lambda t_s: 0.5 * t_s,
-        lambda t_s: 0.5 * max(0.0, t_s - 300),
         lambda t_s: 15.0 * (t_s > 300),
         lambda t_s: 100.0 * (t_s > 100),
         lambda t_s: 40.0 * (t_s % 100 < 60),

@@ -109,7 +109,7 @@ def test_step_finds_the_place_from_another_height_heading_and_tilt(walk, ground)
     "wrong",
     [
         {"roll_deg": math.nan, "pitch_deg": math.nan},
-        *({"height_m": HEIGHT_M * factor} for factor in (-0.05, 0.01, 0.5, 2.0, 100.0)),
+        *({"height_m": HEIGHT_M * factor} for factor in (-0.05, 0.5, 100.0)),
         {"heading_deg": math.inf},
         {"heading_deg": None, "roll_deg": None, "pitch_deg": None, "height_m": None},
     ],
@@ -275,10 +275,7 @@ def test_step_locates_a_tilted_camera_correctly_only_with_its_mount(walk, ground
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("pitch_deg", "reported_deg"),
-    [(12.0, None), (20.0, None), (40.0, None), (60.0, None), (20.0, 0.0), (40.0, 0.0), (60.0, 0.0)],
-)
+@pytest.mark.parametrize(("pitch_deg", "reported_deg"), [(20.0, None), (60.0, None), (20.0, 0.0), (60.0, 0.0)])
 def test_step_claims_an_unreported_tilt(walk, ground, pitch_deg, reported_deg):
     told = LEVEL_POSE | {"roll_deg": reported_deg, "pitch_deg": reported_deg}
     event = walk(make_scaling()).step(frame(ground, 1, pitch_deg=pitch_deg, told=told))
