@@ -11,7 +11,7 @@ from edgevpr.runtime.flight.output import Output
 pytestmark = pytest.mark.slow
 
 WATCHED_S = 60.0
-SETTLED_S = 25.0
+SETTLED_S = 15.0
 MAX_WORSE_M = 3.0
 GPS_AGAIN_S = 10.0
 GPS_INPUT = {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}  # the receiver's fix is a plain 3D one, as ours is
