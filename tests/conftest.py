@@ -26,7 +26,6 @@ LONGEST = (
     "test_gate",
     "test_replay",
     "test_survey",
-    "test_levelling",
     "test_agewatch",
     "test_odometry_gaps",
     "test_ground_stations",

@@ -15,7 +15,7 @@ from edgevpr.techniques import create
 
 pytestmark = pytest.mark.process
 
-PLACES = 1500
+PLACES = 1000
 FRAMES = 30
 LIMIT_BYTES = 700_000_000  # of address space: libraries that are mapped and never touched count as well
 WARM_AFTER = 10  # queries, until every buffer is there
