@@ -189,9 +189,8 @@ class PlaceFilter:
         if geometry.scale.is_ordinal or self._elapsed_s is None:
             return make_motion(None, _MAX_PLACES_PER_QUERY * geometry.scale.spacing)
         if self._odometry and self._elapsed_s > 0:
-            east_m, north_m = self._odometry.moved_m
-            factor_hz = self._odometry.height_ratio / self._elapsed_s
-            velocity_m_s = factor_hz * east_m, factor_hz * north_m
+            ratio, (east_m, north_m) = self._odometry.height_ratio, self._odometry.moved_m
+            velocity_m_s = ratio * east_m / self._elapsed_s, ratio * north_m / self._elapsed_s
             return make_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_visual=True)
         return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
