@@ -77,8 +77,8 @@ def list_landmark_parts(picture: Image) -> Iterator[tuple[str, Callable[[], obje
 
     def measure_step() -> object:
         odometry = VisualOdometry()
-        odometry.measure(0.0, view, before, 1.0)
-        if (step := odometry.measure(1.0, view, after, 1.0)) is None:
+        odometry.measure(0.0, view, before)
+        if (step := odometry.measure(1.0, view, after)) is None:
             raise RuntimeError("visual odometry found no step")
         return step
 

@@ -122,8 +122,8 @@ class AutopilotClock:
             return None
         return t_mono_s if self._uses_own_clock else self.boot_time_s(t_mono_s)
 
-    def sent_s(self, boot_s: float, now_s: float) -> float:
-        """Return when a report stamped `boot_s` was made; its arrival `now_s` if that is unknown or over 1 s ago."""
+    def mono_time_s(self, boot_s: float, now_s: float) -> float:
+        """Return our time of a report stamped `boot_s`; that of its arrival, `now_s`, if unknown or over 1 s ago."""
         delay_s = (self.boot_time_s(now_s) or 0.0) - boot_s
         return now_s - delay_s if 0.0 <= delay_s <= _MAX_STAMP_ERROR_S else now_s
 

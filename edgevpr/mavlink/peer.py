@@ -248,7 +248,7 @@ class Autopilot:
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
                 self.heights.handle(message, now_s, self.attitudes.interpolate(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
-                self.receivers.handle(message, self.clock.sent_s(message.time_usec / 1e6, now_s))
+                self.receivers.handle(message, self.clock.mono_time_s(message.time_usec / 1e6, now_s))
                 if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
                     self._gps_s = now_s
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:

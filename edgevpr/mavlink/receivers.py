@@ -41,7 +41,7 @@ class Receivers:
         self._tracked: dict[str, _TrackedReceiver] = {}
 
     def handle(self, message: Message, t_s: float) -> None:
-        """Process a GPS_RAW_INT or GPS2_RAW of time `t_s` from the autopilot."""
+        """Process a GPS_RAW_INT or GPS2_RAW from the autopilot, whose fix is of time `t_s`."""
         name = message.get_type()
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._tracked.pop(name, None)

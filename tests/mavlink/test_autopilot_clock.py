@@ -106,7 +106,7 @@ def test_report_of_a_receiver_counts_from_its_boot_time(age_s, counted_s):
     now_s = autopilot.clock.now_s
     report = autopilot.conversation.autopilot.receivers.choose_best(now_s)
     assert report.t_s == pytest.approx(now_s - counted_s, abs=0.01)
-    assert AutopilotClock().sent_s(1.0, now_s) == now_s, "unknown"
+    assert AutopilotClock().mono_time_s(1.0, now_s) == now_s, "unknown"
 
 
 def test_handle_ignores_an_unrequested_answer():

@@ -186,7 +186,7 @@ class Navigator(Listener):
         if vehicle.velocity_m_s is None:
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
         reported, located = event.vehicle or vehicle, event.located
-        if located and located.height_m and reported.height_m:
+        if located and located.height_m and reported.height_m and reported.height_m > 0:
             error = located.height_m / reported.height_m - 1.0
             self._navigation.restart_odometry_scale(error, _MATCH_SCALE_TOLERANCE)
         predicted = self._navigation.predict_fix(match)

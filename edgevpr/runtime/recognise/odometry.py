@@ -26,8 +26,7 @@ class OdometryStep:
     """Motion from the frame at `from_s` to that at `to_s`: `moved_m` (east, north), correct if the reported heading and
     height are. `sd_m` is the standard deviation of each axis from the landmarks alone, of which `inliers` agree. `zoom`
     is the natural logarithm of the ratio of the ground shown to that in the previous picture, beyond what the heights
-    explain: 0 over flat ground, positive over ground that falls away. `height_ratio`: height above the ground that the
-    last match showed, divided by the reported one."""
+    explain: 0 over flat ground, positive over ground that falls away."""
 
     from_s: float
     to_s: float
@@ -35,7 +34,6 @@ class OdometryStep:
     sd_m: float
     inliers: int
     zoom: float = 0.0
-    height_ratio: float = 1.0
 
     def fields(self) -> dict[str, Any]:
         """Return this step as fields of the flight log."""
@@ -50,9 +48,8 @@ class VisualOdometry:
     def __init__(self) -> None:
         self._previous: tuple[float, View, Landmarks] | None = None
 
-    def measure(self, t_s: float, view: View, landmarks: Landmarks, height_ratio: float) -> OdometryStep | None:
-        """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured.
-        `height_ratio`: as in `OdometryStep`."""
+    def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
+        """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
         last, self._previous = self._previous, (t_s, view, landmarks.select_best(PLACE_LANDMARKS))
         if last is None or not 0 < t_s - last[0] <= _MAX_ELAPSED_S:
             return None
@@ -83,5 +80,4 @@ class VisualOdometry:
             sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
             zoom=math.log(scale),
-            height_ratio=height_ratio,
         )

@@ -115,17 +115,23 @@ class PlaceFilter:
         self._t_committed_s: float | None = None
         self._elapsed_s: float | None = None
         self._velocity_m_s: tuple[float, float] | None = None
-        self._odometry: OdometryStep | None = None
+        self._moved_m: tuple[float, float] | None = None  # by odometry
 
-    def predict(self, frame: Frame, vehicle: Vehicle | None, odometry: OdometryStep | None = None) -> None:
+    def predict(
+        self, frame: Frame, vehicle: Vehicle | None, odometry: OdometryStep | None = None, height_ratio: float = 1.0
+    ) -> None:
         """Store the time of the next query and the motion since the last committed one, for `update`: the motion
-        measured by `odometry` since the previous frame or, without it, derived from the autopilot's velocity."""
+        measured by `odometry` since the previous frame or, without it, derived from the autopilot's velocity.
+        `height_ratio`: height above ground that the last match showed, divided by the reported one."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_committed_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
         is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if vehicle and is_fresh else None
-        self._odometry = odometry if odometry and odometry.from_s == before_s else None
+        self._moved_m = None
+        if odometry and odometry.from_s == before_s:
+            east_m, north_m = odometry.moved_m
+            self._moved_m = height_ratio * east_m, height_ratio * north_m
 
     def update(
         self,
@@ -188,9 +194,8 @@ class PlaceFilter:
     def _make_motion(self, geometry: _MapGeometry) -> Motion:
         if geometry.scale.is_ordinal or self._elapsed_s is None:
             return make_motion(None, _MAX_PLACES_PER_QUERY * geometry.scale.spacing)
-        if self._odometry and self._elapsed_s > 0:
-            ratio, (east_m, north_m) = self._odometry.height_ratio, self._odometry.moved_m
-            velocity_m_s = ratio * east_m / self._elapsed_s, ratio * north_m / self._elapsed_s
+        if self._moved_m and self._elapsed_s > 0:
+            velocity_m_s = self._moved_m[0] / self._elapsed_s, self._moved_m[1] / self._elapsed_s
             return make_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_visual=True)
         return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 

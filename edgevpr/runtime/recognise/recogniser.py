@@ -187,7 +187,7 @@ class Recogniser:
         if self._odometry is None or not view.is_georeferenced:
             return None
         with self.meter.step("odometry"):
-            return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks, self._prior.height_ratio)
+            return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks)
 
     def _decide(self, query: EncodedFrame, verifier: Verifier, odometry_step: OdometryStep | None) -> Decision:
         """Search the map for an encoded frame, and update the hints for the next query with the decision."""
@@ -195,7 +195,7 @@ class Recogniser:
         objection = check_texture(query.descriptor, self.rule.min_quality)
         objection = objection or query.view.reason or (query.salience.reason if query.salience else None)
         if place_filter:
-            place_filter.predict(query.frame, query.vehicle, odometry_step)
+            place_filter.predict(query.frame, query.vehicle, odometry_step, self._prior.height_ratio)
         if objection and self.matcher.search is None:  # a sequence needs every query
             if place_filter:
                 place_filter.update_without_match(self.index)

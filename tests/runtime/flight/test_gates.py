@@ -217,14 +217,14 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, error):
 
 
 @pytest.mark.parametrize(
-    ("height_m", "median_ratio", "error"),
-    [(132.0, 1.0, 0.32), (112.0, 1.0, 0.0), (112.0, 1.12, 0.12), (137.0, 1.34, 0.34)],
+    ("height_m", "median_ratio", "reported_m", "error"),
+    [(132, 1.0, 100, 0.32), (112, 1.0, 100, 0), (112, 1.12, 100, 0.12), (137, 1.34, 100, 0.34), (60, 1.0, -5, 0)],
 )
-def test_heights_of_matches_correct_the_scale_of_odometry(height_m, median_ratio, error):
+def test_heights_of_matches_correct_the_scale_of_odometry(height_m, median_ratio, reported_m, error):
     navigator, filtered = navigate(), DriftFilter(INERTIAL, 1.0)
     navigator._navigation.restart_odometry_scale = filtered.restart_odometry_scale
     navigator.correct_height(median_ratio)
-    seen = fake_match(vehicle=make_vehicle(*HOME, NOW_S, height_m=100))
+    seen = fake_match(vehicle=make_vehicle(*HOME, NOW_S, height_m=reported_m))
     navigator.advise(replace(seen, located=replace(seen.located, height_m=height_m)), NOW_S)
     assert filtered._x[10] == pytest.approx(error)
 

@@ -29,8 +29,8 @@ def take_view(ground, pose, told=None, scale=1.0):
 
 def measure_odometry(first, second, after_s=1.0):
     strides = VisualOdometry()
-    assert strides.measure(5.0, *first, 1.0) is None
-    return strides.measure(5.0 + after_s, *second, 1.0)
+    assert strides.measure(5.0, *first) is None
+    return strides.measure(5.0 + after_s, *second)
 
 
 @pytest.mark.parametrize(
@@ -57,8 +57,9 @@ def test_odometry_is_scaled_by_a_wrong_height_and_rotated_by_a_wrong_compass(gro
     low, turned = ({"height_m": 90.0}, {"heading_deg": 40.0})
     pair = [take_view(ground, pose, replace(pose, **low)) for pose in (START, second)]
     assert measure_odometry(*pair).moved_m == pytest.approx((27.0, 0.0), abs=0.7)
-    scaled = take_view(ground, second, replace(second, **low), 1 / 0.9)
-    assert measure_odometry(pair[0], scaled).moved_m == pytest.approx((27.0, 0.0), abs=0.7), "whatever its scale"
+    scaled = [take_view(ground, pose, replace(pose, **low), 1 / 0.9) for pose in (START, second)]
+    for first in (pair[0], scaled[0]):
+        assert measure_odometry(first, scaled[1]).moved_m == pytest.approx((27.0, 0.0), abs=0.7), "whatever the scale"
     pair = [take_view(ground, pose, replace(pose, **turned)) for pose in (START, second)]
     east, north = measure_odometry(*pair).moved_m
     assert math.degrees(math.atan2(-north, east)) == pytest.approx(10.0, abs=1.0)

@@ -61,11 +61,9 @@ class Flight:
         """Go on, `moved_m` (east, north) by the camera's own motion."""
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = make_vehicle(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
-        stride = moved_m and OdometryStep(
-            from_s=before_s, to_s=self.t_s, moved_m=(moved_m[0] / 1.4, moved_m[1] / 1.4), sd_m=0.2, inliers=100,
-            height_ratio=1.4,
-        )  # fmt: skip
-        self.follower.predict(Frame(image=BLANK, name="", t_mono_s=self.t_s), vehicle, stride)
+        told_m = moved_m and (moved_m[0] / 1.4, moved_m[1] / 1.4)  # by a reported height that is too low
+        stride = moved_m and OdometryStep(from_s=before_s, to_s=self.t_s, moved_m=told_m, sd_m=0.2, inliers=100)
+        self.follower.predict(Frame(image=BLANK, name="", t_mono_s=self.t_s), vehicle, stride, 1.4)
 
     def handle(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
         """Update the filter with a query whose best place is `place`; 2.5 is halfway between places 2 and 3. 80
