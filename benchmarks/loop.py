@@ -30,6 +30,7 @@ CHANGES = {
     **{f"times {time_s:+g} s wrong": {"time_error_s": time_s} for time_s in (-0.3, -0.1, 0.1, 0.3)},
     **{f"odometry scale {scale:g}": {"stride_scale": scale} for scale in (0.7, 0.9, 1.1, 1.4)},
     **{f"camera tilted by {tilt_deg:g} degrees": {"mount_tilt_deg": tilt_deg} for tilt_deg in (-5.0, -2.0, 2.0, 5.0)},
+    **{f"heading wrong by {error_deg:g} degrees": {"heading_error_deg": error_deg} for error_deg in (-15.0, 15.0)},
 }
 FACTORS = (1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0)
 FACTOR_CHANGES = ("nothing", "answers 1 s late", "times +0.3 s wrong", "odometry scale 0.7")

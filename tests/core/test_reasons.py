@@ -21,6 +21,9 @@ def parse_package():
             yield path, ast.parse(path.read_text("utf-8"))
 
 
+CONFIDENCE = {"confidence": 0.5, "min_confidence": 0.9995, "regions_ratio": 2.0, "regions_share": 0.25}
+
+
 @pytest.mark.parametrize(
     ("code", "parameters", "sentence"),
     [
@@ -28,14 +31,7 @@ def parse_package():
         ("UNUSABLE", {"problem": "1.png is truncated."}, "1.png is truncated."),
         (
             "LOW_CONFIDENCE",
-            {
-                "confidence": 0.5,
-                "min_confidence": 0.9995,
-                "regions_ratio": 2.0,
-                "regions_share": 0.25,
-                "landmarks": 7,
-                "track_confidence": None,
-            },
+            CONFIDENCE | {"track_confidence": None, "landmarks": 7},
             "confidence too low: confidence 50.0 %, 1 in 2,000 wrong needed: 2.0 times as many regions agree as for "
             "the runner-up (25%), 7 landmarks agree",
         ),

@@ -2,6 +2,7 @@
 conversation and the navigator of edgevpr beside it, in steps of 20 ms. The same flight without edgevpr is its control.
 """
 
+import cmath
 import math
 from dataclasses import replace
 
@@ -37,9 +38,9 @@ class ClosedLoop:
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
     the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long,
     `time_error_s` by how much frames carry too late a time, and `mount_tilt_deg` by how much the camera looks east of
-    straight down. Gyros have the noise `gyro_sd` (radians, a root second); matches show the error of the attitude where
-    they `show_tilt`. `away_m` and `error_m` are, step by step, the true distance from the target, and that of the
-    autopilot's estimate from the truth; `sent` is all that edgevpr sends, with the times."""
+    straight down. `heading_error_deg` is the autopilot's. Gyros have the noise `gyro_sd` (radians, a root second);
+    matches show the error of the attitude where they `show_tilt`. `away_m` and `error_m` are, step by step, the true
+    distance from the target, and that of the estimate from the truth; `sent` is all that is sent, with the times."""
 
     def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, min_accuracy_m=1.0, **parameters):
         self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)
@@ -49,7 +50,7 @@ class ClosedLoop:
         self.sees_motion = True
         self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
         self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
-        self.gyro_sd, self.show_tilt = 0.0, False
+        self.heading_error_deg, self.gyro_sd, self.show_tilt = 0.0, 0.0, False
         self.away_m, self.error_m, self.sent = [], [], []
         self._clock, self._rng, self._steps = FakeClock(), np.random.default_rng(5), 0
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
@@ -84,6 +85,7 @@ class ClosedLoop:
             self._clock.now_s = 1000.0 + self.now_s
             if self.gyro_sd:
                 self.brain.estimator.disturb(self._noise(self.gyro_sd * math.sqrt(STEP_S)))
+            self.brain.heading_error_deg = self.heading_error_deg
             said = self.controller.advance(self.now_s + STEP_S / 2)
             self.away_m.append(self.motion.away_m)
             self.error_m.append(self.controller.error_m)
@@ -156,6 +158,7 @@ class ClosedLoop:
             shown = self.show_tilt and self._noise(_SHOWN_SD) - self.brain.tilt
             error = AttitudeError((shown.real, shown.imag), _SHOWN_SD) if self.show_tilt else None
             event = make_match(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
+            event = replace(event, located=replace(event.located, heading_deg=-self.heading_error_deg))
         else:
             frame = Frame(image=PICTURE, name="", t_mono_s=t_s)
             event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(PICTURE, None, _VIEW))
@@ -166,7 +169,8 @@ class ClosedLoop:
         if before is None or not self.sees_motion:
             return None
         was, from_s, tilt = before
-        moved_m = self.stride_scale * displacement_m(was.point, truth.point)
+        scale = cmath.rect(self.stride_scale, -math.radians(self.heading_error_deg))
+        moved_m = scale * displacement_m(was.point, truth.point)
         moved_m += HEIGHT_M * (self.brain.tilt - tilt) + self._noise(_STRIDE_SD_M)
         return OdometryStep(
             from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100

@@ -58,10 +58,10 @@ class SimFlight:
     (2,) m/s, which changes by `gusts` m/s a second, and by `velocity_sd` m/s of noise; what is sent it takes. Matches
     of `fix_sd_m` and `other_sd_m`, which say `said_sd_m` of themselves, come every `every_s` and are `late_s` old.
     With a `stride_sd_m`, each frame has its stride, too long by `stretch` and turned by `turn` (radians, to the right),
-    as by a compass that is wrong, and its match shows that where it `shows_turn`;
-    without `matches`, no place is accepted. Without GPS, a frame is taken every `stride_s` for its stride only
-    (None: none is). The times of its frames have the standard deviation `t_sd_s`. `gps_off_m` (2,) is by how much the
-    receiver is wrong; the autopilot follows it until it `reject_gps`."""
+    as by a compass that is wrong (or a rotated camera, unless it `turns_compass`), and its match shows that where it
+    `shows_turn`; without `matches`, no place is accepted. Without GPS, a frame is taken every `stride_s` for its stride
+    only (None: none is). The times of its frames have the standard deviation `t_sd_s`. `gps_off_m` (2,) is by how much
+    the receiver is wrong; the autopilot follows it until it `reject_gps`."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class SimFlight:
         self.is_silent = self.knows_nothing = False
         self.takes_fixes, self.matches, self.events = True, True, []
         self.stride_sd_m, self.stretch, self.turn, self.strode = stride_sd_m, 1.0, 0.0, None
-        self.shows_turn = False
+        self.shows_turn, self.turns_compass = False, True
         self.advices: list[tuple[float, Advice]] = []
         self.errors_m, self.states = [], []  # of the autopilot once a second; of a continuous channel
         self.between, self.between_due_s = [], 0.0  # fixes that no match asked for, and their errors
@@ -213,7 +213,8 @@ class SimFlight:
 
     def _report_force(self, acceleration_m_s2: np.ndarray) -> None:
         east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)
-        self.navigator.handle_specific_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
+        attitude = Attitude(self.t_s, 0.0, 0.0, math.degrees(self.turn * self.turns_compass))
+        self.navigator.handle_specific_force(self.t_s, (north, east, -_GRAVITY_M_S2), attitude)
 
     def _report(self, velocity: np.ndarray) -> None:
         here = offset_position(*HOME, *(self.at_m + self.off_m))

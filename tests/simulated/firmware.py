@@ -1,6 +1,7 @@
 """The common part of the simulated firmwares, ArduPilot and PX4: parameters and a position estimator. The error of the
 estimate grows by a simple model. A point is (latitude, longitude) in degrees, a vector east + 1j * north."""
 
+import cmath
 import math
 import struct
 from abc import ABC, abstractmethod
@@ -44,6 +45,7 @@ class Firmware(ABC):
     filter_report: ClassVar[int]  # number of the message
     default_hz: ClassVar[Mapping[int, float]] = {}
     velocity_ratio = 0.1  # innovation of measured velocities to their gate
+    heading_error_deg = 0.0  # of a vehicle that obeys its estimate; the filter does not correct it
 
     def __init__(self, kind: str, motion: Motion, parameters: dict[str, float]) -> None:
         self.kind, self.motion = kind, motion
@@ -60,8 +62,10 @@ class Firmware(ABC):
     def step(self, dt_s: float) -> None:
         """Advance by `dt_s` seconds: motion, sensors, estimator."""
         self.now_s += dt_s
-        self.motion.steer(self.estimator.error_m, self.estimator.velocity_error_m_s, self.tilt)
+        turn = cmath.rect(1.0, math.radians(self.heading_error_deg))
+        self.motion.steer(self.estimator.error_m, self.estimator.velocity_error_m_s, self.tilt, turn)
         self.truth = self.motion.step(self.now_s, dt_s)
+        self.estimator.velocity_error_m_s += (turn.conjugate() - 1) * self.truth.acceleration_m_s2 * dt_s
         self.receivers.step(self.truth, self.now_s)
         self._estimate(1j * self.parameters["SIM_WIND_SPD"], dt_s)
 

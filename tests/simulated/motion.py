@@ -60,8 +60,8 @@ class Motion:
     def begin(self, now_s: float) -> None:
         """Start the track, if there is one: an onboard computer in flight was heard."""
 
-    def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex) -> None:
-        """Steer by an estimate with these errors (see `Estimator`), if the vehicle obeys it."""
+    def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex, turn: complex) -> None:
+        """Steer by an estimate with these errors (see `Estimator`), and a heading wrong by `turn`, if it is obeyed."""
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
         """Move for `dt_s` seconds, up to `now_s`, and return the state then."""
@@ -86,11 +86,11 @@ class Hover(Motion):
     def away_m(self) -> float:
         return abs(self._offset_m - self._target_m)
 
-    def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex) -> None:
+    def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex, turn: complex) -> None:
         to_target_m = self._target_m - (self._offset_m + error_m)
         wanted_m_s = self._cruise_m_s + _limit(_SPEED_GAIN_HZ * to_target_m, _MAX_CORRECTION_M_S)
         missing_m_s = wanted_m_s - (self._velocity_m_s + velocity_error_m_s)
-        self._acceleration_m_s2 = _limit(_ACCELERATION_GAIN_HZ * missing_m_s, _MAX_ACCELERATION_M_S2)
+        self._acceleration_m_s2 = turn * _limit(_ACCELERATION_GAIN_HZ * missing_m_s, _MAX_ACCELERATION_M_S2)
         self._acceleration_m_s2 -= GRAVITY_M_S2 * tilt
 
     def step(self, now_s: float, dt_s: float) -> TrueState:

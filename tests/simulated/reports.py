@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from edgevpr.mavlink.wire import Message, mavlink
 from simulated.firmware import Firmware
-from simulated.motion import GRAVITY_M_S2, TrueState, compute_tilt
+from simulated.motion import GRAVITY_M_S2, compute_tilt
 from simulated.sensors import NOTHING, PositionMeasurement
 
 Report = Callable[[Firmware], Message | None]
@@ -42,7 +42,7 @@ def _position(brain: Firmware) -> Message | None:
         round(truth.alt_m * 1e3),
         0 if math.isnan(truth.height_m) else round(truth.height_m * 1e3),
         *(max(-_MAX_CM_S, min(_MAX_CM_S, round(100 * speed_m_s))) for speed_m_s in ned_m_s),
-        _UNKNOWN_16 if math.isnan(truth.heading_deg) else round(truth.heading_deg * 100) % 36_000,
+        _UNKNOWN_16 if math.isnan(truth.heading_deg) else round(math.degrees(_compute_yaw(brain)) * 100) % 36_000,
     )
 
 
@@ -55,7 +55,7 @@ def _attitude(brain: Firmware) -> Message | None:
     if math.isnan(roll_deg + pitch_deg):  # the track does not say
         return None
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
-    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, compute_yaw(truth), 0, 0, 0)
+    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, _compute_yaw(brain), 0, 0, 0)
 
 
 def _specific_force(brain: Firmware) -> Message:
@@ -143,6 +143,7 @@ def _boot_ms(brain: Firmware) -> int:
     return round(brain.now_s * 1000) % 2**32
 
 
-def compute_yaw(truth: TrueState) -> float:
-    """Return the yaw in radians, -pi..pi; 0 where the heading is unknown."""
-    return 0.0 if math.isnan(truth.heading_deg) else math.remainder(math.radians(truth.heading_deg), math.tau)
+def _compute_yaw(brain: Firmware) -> float:
+    """Return the estimated yaw in radians, -pi..pi; 0 where the heading is unknown."""
+    yaw = math.radians(brain.truth.heading_deg + brain.heading_error_deg)
+    return 0.0 if math.isnan(yaw) else math.remainder(yaw, math.tau)

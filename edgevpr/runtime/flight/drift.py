@@ -31,13 +31,15 @@ _ODOMETRY_NOISE = 0.003  # random change of that error in one second
 # an ArduPilot plane. The rotation of a match measures it (radians: standard deviation, and the largest that is used).
 _GPS_LOSS_TURN_FACTOR = 10.0
 _ROTATION_SD_RAD = 0.035
-_MAX_ROTATION_RAD = 0.3
+_MAX_ROTATION_RAD = 0.4
+_MAX_ROTATION_SIGMA = 3.0  # a larger change: the autopilot has corrected its heading
 
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
-_SIZE = 12
+_SIZE = 13
 _EYE = np.eye(2)
 _SCALE = 10
 _TURN = 11
+_HEADING = 12
 _FRAME = np.zeros((2, _SIZE))  # measurement matrix of `f`
 _FIX = np.zeros((2, _SIZE))  # measurement matrix of a frame's fix
 _FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
@@ -55,6 +57,7 @@ class Drift:
     velocity_noise: float
     acceleration_noise: float
     is_inertial: bool  # the path is integrated from accelerations, so an attitude error causes an acceleration error
+    heading_sd: float = 0.0  # radians, error of the heading by which accelerations are rotated
     # The autopilot follows our positions closely and mistakes their errors for motion, so its attitude is assumed to be
     # poor when GPS is lost, until pictures show that it is good.
     attitude_follows_positions: bool = False
@@ -69,9 +72,9 @@ DEAD_RECKONING = Drift(
 # Accelerations, rotated into east and north by the autopilot's attitude: an error of half a degree is 0.09 m/s2.
 INERTIAL = Drift(
     velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02,
-    is_inertial=True,
+    is_inertial=True, heading_sd=0.05,
 )  # fmt: skip
-INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
+INERTIAL_PX4 = replace(INERTIAL, heading_sd=0.15, attitude_follows_positions=True)  # up to 20 degrees in its simulator
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,13 +91,14 @@ class DriftFilter:
     """Kalman filter that estimates the errors of one path. `drift` is the size of these errors, `map_sd_m` the standard
     deviation, of one axis, of the error common to all fixes.
 
-    The state has six parts, each east and north:
+    The state has seven parts; all but the last are two numbers, mostly east and north:
     - `c` (m): the offset from the path to the aircraft
     - `s` (m/s): the aircraft's velocity minus the path's
     - `b` (m/s2): minus the acceleration error that an attitude error causes through gravity; ds/dt of an inertial path
     - `m` (m): the offset from GPS positions to fixes
     - `f` (m): the offset from the path to the position measured in the last frame's picture
     - `k`: the error of scale and direction (radians, clockwise) of all odometry
+    - the error of the heading (radians, clockwise), by which accelerations and odometry are rotated
 
     A frame may have been taken seconds ago: it is compared with the path at that time. An attitude error shifts its
     `f`, and so its fix, by minus `b` times `attitude_gain_s2`: the height above ground divided by gravity (0: the
@@ -115,7 +119,7 @@ class DriftFilter:
         of its offset and of the velocity error."""
         self._x = np.zeros(_SIZE)
         sds = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _ODOMETRY_SD
-        self._p = np.diag(np.repeat(np.square(sds), 2))
+        self._p = np.diag(np.square(np.append(np.repeat(sds, 2), self._drift.heading_sd)))
 
     @property
     def attitude_error_sd(self) -> float:
@@ -123,13 +127,15 @@ class DriftFilter:
         their own errors."""
         return self._attitude_error_sd * math.sqrt(max(0.0, self._attitude_error - _CALM_ERROR))
 
-    def predict(self, step_s: float) -> None:
-        """Predict the state `step_s` seconds later."""
+    def predict(self, step_s: float, acceleration_m_s2: Doubles) -> None:
+        """Predict the state `step_s` seconds later; `acceleration_m_s2` (2,): the mean one of an inertial path."""
         move = np.eye(_SIZE)
         move[_C, _S] = step_s * _EYE
         if self._drift.is_inertial:
             move[_C, _B] = step_s**2 / 2 * _EYE
             move[_S, _B] = step_s * _EYE
+            east_m_s2, north_m_s2 = acceleration_m_s2
+            move[_S, _HEADING] = step_s * north_m_s2, -step_s * east_m_s2
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_ERROR_TIME_S) * _EYE
         drift = self._drift
@@ -137,10 +143,10 @@ class DriftFilter:
         roughness = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
         factor = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, roughness)) * drift.is_inertial
         random_walk = drift.acceleration_noise * (factor + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
-        noise = np.repeat(
-            (drift.position_noise, drift.velocity_noise, random_walk, 0.0, 0.0, _ODOMETRY_NOISE * factor), 2
-        )
-        noise[_TURN] += _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
+        turn_noise = _ODOMETRY_NOISE * (factor + _GPS_LOSS_TURN_FACTOR * self._gps_loss)
+        noise = np.zeros(_SIZE)
+        noise[:_SCALE] = np.repeat((drift.position_noise, drift.velocity_noise, random_walk, 0.0, 0.0), 2)
+        noise[_SCALE], noise[_HEADING if drift.is_inertial else _TURN] = _ODOMETRY_NOISE, turn_noise
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
@@ -175,6 +181,7 @@ class DriftFilter:
             return True
         (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, np.eye(_SIZE)
         transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
+        transition[_F, _HEADING] = transition[_F, _TURN]
         x, p = transition @ self._x, transition @ self._p @ transition.T
         x[_F] += odometry.error_m
         p[_F, _F] += odometry.sd_m**2 * _EYE
@@ -186,13 +193,16 @@ class DriftFilter:
         return True
 
     def correct_by_rotation(self, rotation: float) -> None:
-        """Correct the direction of odometry by a match whose picture is rotated by `rotation` (radians, clockwise)
-        against the compass. A large rotation is ignored: odometry then contradicts the path and is not used.
-        Rotations are also ignored if the path is integrated from accelerations: it then has the same compass error."""
-        if abs(rotation) <= _MAX_ROTATION_RAD and not self._drift.is_inertial:
-            matrix = np.zeros((1, _SIZE))
-            matrix[0, _TURN] = 1.0
-            self._correct(matrix, np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]]))
+        """Correct the direction of odometry and the heading by a match whose picture is rotated by `rotation` (radians,
+        clockwise) against the compass. A large rotation is ignored: odometry then contradicts the path and is not used.
+        The motion shows later whether the camera or the compass is rotated."""
+        if abs(rotation) > _MAX_ROTATION_RAD:
+            return
+        matrix = np.eye(_SIZE)[[_TURN]] + np.eye(_SIZE)[[_HEADING]]
+        error, variance = np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]])
+        if mahalanobis(error - matrix @ self._x, matrix @ self._p @ matrix.T + variance) > _MAX_ROTATION_SIGMA:
+            self._p[_HEADING, _HEADING] += self._drift.heading_sd**2
+        self._correct(matrix, error, variance)
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""
@@ -238,7 +248,7 @@ class DriftFilter:
         return errors[:2], errors[2:], matrix @ self._p @ matrix.T
 
     def _make_motion_jacobian(self, age_s: float) -> Doubles:
-        """Return the observation matrix (4, 12) for the offset and the velocity error of the path `age_s` ago."""
+        """Return the observation matrix (4, 13) for the offset and the velocity error of the path `age_s` ago."""
         matrix = np.zeros((4, _SIZE))
         matrix[:2] = self._make_position_jacobian(age_s, 0.0)
         matrix[2:, _S], matrix[2:, _B] = _EYE, -age_s * self._drift.is_inertial * _EYE
@@ -253,14 +263,14 @@ class DriftFilter:
         self._p[_F, _F] += variance_m2 * _EYE
 
     def _correct(self, matrix: Doubles, measured: Doubles, covariance: Doubles) -> None:
-        """Do a Kalman update with the measurement matrix `matrix` (n, 12) and the values `measured` (n,)."""
+        """Do a Kalman update with the measurement matrix `matrix` (n, 13) and the values `measured` (n,)."""
         gain = np.linalg.solve(matrix @ self._p @ matrix.T + covariance, matrix @ self._p).T
         self._x = self._x + gain @ (measured - matrix @ self._x)
         ikh = np.eye(_SIZE) - gain @ matrix  # I - K H
         self._p = ikh @ self._p @ ikh.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
     def _make_position_jacobian(self, age_s: float, attitude_gain_s2: float) -> Doubles:
-        """Return the observation matrix (2, 12) of a position measured `age_s` seconds ago, as an offset from the
+        """Return the observation matrix (2, 13) of a position measured `age_s` seconds ago, as an offset from the
         path. `attitude_gain_s2`: how strongly an attitude error shifts the position measured in the picture."""
         matrix = np.zeros((2, _SIZE))
         matrix[:, _C], matrix[:, _S] = _EYE, -age_s * _EYE

@@ -56,8 +56,9 @@ class Navigation:
 
     Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions, also
     from those sent before edgevpr was restarted: such a path starts only at a receiver or a match, and GPS is the
-    position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS
-    contradicts our position, and no recent match proves it."""
+    position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS contradicts our
+    position, and no recent match proves it. `last_gps_s`, `last_fix_s`: when a GPS position or a match was last used
+    (-inf: never)."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -66,25 +67,15 @@ class Navigation:
         self._frame_point: Point | None = None  # of the path, when the last frame was taken
         self._last_fix_m: Doubles | None = None  # (2,) from the origin of the path
         self.has_gps = self.is_in_doubt = False
-        self._last_gps_s = self._last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
+        self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
         self._odometry_since_fix = _OdometrySinceFix()
         self._contradicted_since_s: float | None = None
 
     @property
-    def last_fix_s(self) -> float:
-        """Time of the last match accepted as a fix; -inf before the first."""
-        return self._last_fix_s
-
-    @property
     def last_vision_s(self) -> float:
         """Time of the last fix or odometry step; -inf before the first."""
-        return max(self._last_fix_s, self._last_odometry_s)
-
-    @property
-    def last_gps_s(self) -> float:
-        """Time of the last GPS position that was used; -inf before the first."""
-        return self._last_gps_s
+        return max(self.last_fix_s, self._last_odometry_s)
 
     @property
     def attitude_error_sd(self) -> float:
@@ -123,11 +114,11 @@ class Navigation:
             position = Position(vehicle.lat_deg, vehicle.lon_deg)
             self._start(position, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
             return
-        self._filter.predict(path.add_velocity(t_s, velocity_m_s))
+        self._filter.predict(path.add_velocity(t_s, velocity_m_s), np.zeros(2))
         if had_gps and not self.has_gps:
             self._filter.lose_gps()
         point = path.interpolate(t_s)
-        if point and self.has_gps and t_s - self._last_gps_s >= _GPS_INTERVAL_S:
+        if point and self.has_gps and t_s - self.last_gps_s >= _GPS_INTERVAL_S:
             self._record_gps(t_s)
             offset_m = path.compute_offset_m(vehicle.lat_deg, vehicle.lon_deg) - point.position_m
             sd_m = _GPS_CORRELATION_FACTOR * (vehicle.position_sd_m or _UNKNOWN_POSITION_SD_M)
@@ -152,13 +143,13 @@ class Navigation:
             self._handle_contradiction(receiver, vehicle.t_received_s)
             return
         self.has_gps, self.is_in_doubt, self._contradicted_since_s = True, False, None
-        if vehicle.t_received_s - self._last_gps_s >= _GPS_INTERVAL_S:
+        if vehicle.t_received_s - self.last_gps_s >= _GPS_INTERVAL_S:
             self._record_gps(vehicle.t_received_s)
             self._filter.correct_by_gps(offset_m, sd_m, error_m_s, sd_m_s, age_s)
 
     def _handle_contradiction(self, receiver: Receiver, now_s: float) -> None:
         """Process a receiver that contradicts our position: restart there if this persists and no match proves ours."""
-        self.has_gps, self.is_in_doubt = False, now_s - self._last_fix_s > MATCH_PROOF_S
+        self.has_gps, self.is_in_doubt = False, now_s - self.last_fix_s > MATCH_PROOF_S
         if self._contradicted_since_s is None:
             self._contradicted_since_s = now_s
         contradicted_s = min(receiver.steady_for_s, now_s - self._contradicted_since_s)
@@ -196,7 +187,7 @@ class Navigation:
         return True
 
     def _record_gps(self, now_s: float) -> None:
-        self._last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix(now_s)
+        self.last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix(now_s)
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         self._filter.restart_odometry_scale(error, tolerance)
@@ -204,19 +195,16 @@ class Navigation:
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
         if (path := self._valid_path) and self._drift.is_inertial:
-            self._filter.predict(path.add_acceleration(t_s, acceleration_m_s2))
+            self._filter.predict(path.add_acceleration(t_s, acceleration_m_s2), acceleration_m_s2)
 
-    def add_frame(self, frame: FrameMeasurement, is_query: bool = True, heading_error_deg: float | None = None) -> None:
-        """Process a frame, whether it was recognised or not; one that is not a query only provides odometry.
-        `heading_error_deg`: heading error of its match (see `PositionedMatch`)."""
+    def add_frame(self, frame: FrameMeasurement, is_query: bool = True) -> None:
+        """Process a frame, whether it was recognised or not; one that is not a query only provides odometry."""
         if is_query:
             self._query_interval_s, self._last_query_s = frame.t_s - self._last_query_s, frame.t_s
         path, before = self._valid_path, self._frame_point
         self._frame_point = point = path.interpolate(frame.t_s) if path else None
         if path is None or point is None:
             return
-        if heading_error_deg is not None:
-            self._filter.correct_by_rotation(math.radians(heading_error_deg))
         step, odometry = frame.odometry, None
         if step and before and before.t_s == step.from_s:
             moved_m = np.array(step.moved_m)
@@ -229,7 +217,7 @@ class Navigation:
     def predict_fix(self, match: PositionedMatch) -> PredictedFix | None:
         """Predict the fix of a match in the last frame added or a new one; None if the path is unknown at that time."""
         if self._frame_point is None or self._frame_point.t_s != match.t_s:
-            self.add_frame(match.frame, heading_error_deg=match.heading_error_deg)
+            self.add_frame(match.frame)
         path, point = self._valid_path, self._frame_point
         if path is None or point is None:
             return None
@@ -250,8 +238,10 @@ class Navigation:
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
                 self._filter.correct_by_attitude_error(np.array(error.nadir_shift), error.sd)
-            self._last_fix_s = max(self._last_fix_s, match.t_s)
-            self._odometry_since_fix = _OdometrySinceFix(self._last_fix_s)
+            if match.heading_error_deg is not None:
+                self._filter.correct_by_rotation(math.radians(match.heading_error_deg))
+            self.last_fix_s = max(self.last_fix_s, match.t_s)
+            self._odometry_since_fix = _OdometrySinceFix(self.last_fix_s)
 
     def _repetition_factor(self, fix: PredictedFix) -> float:
         """Return the factor for the covariance of a fix: the closer it is to the last fix, the more of its error is
@@ -270,7 +260,7 @@ class Navigation:
         if self._drift.is_inertial:
             sd_m = math.hypot(sd_m, _UNKNOWN_VELOCITY_SD_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _UNKNOWN_VELOCITY_SD_M_S)
-            self._last_fix_s = t_s
+            self.last_fix_s = t_s
 
     def estimate_state(self, t_s: float) -> NavState | None:
         """Return position and velocity at `t_s`, now or in the last seconds; None if unknown."""

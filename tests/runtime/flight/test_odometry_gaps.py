@@ -65,6 +65,15 @@ def test_odometry_bridges_a_minute_off_the_map_to_three_per_cent_of_the_distance
     assert said_m[-1] < 0.04 * way_m
 
 
+@pytest.mark.parametrize("turns_compass", [True, False], ids=["compass", "camera"])
+@pytest.mark.parametrize("channel", [Channel.GPS_INPUT, Channel.SENSOR])
+def test_odometry_bridges_a_gap_if_matches_show_a_large_rotation(channel, turns_compass):
+    air = make_air(channel, stride_sd_m=0.2)
+    air.turn, air.shows_turn, air.turns_compass = -0.3, True, turns_compass
+    errors_m, _ = fly_across_gap(air)
+    assert norms(errors_m).max() < 8.0
+
+
 def test_gap_without_odometry_is_not_bridged():
     errors_m, said_m = fly_across_gap(make_air(Channel.COMMAND))
     assert norms(errors_m).max() > 30.0
@@ -138,8 +147,7 @@ def fly_with_failing_compass(shows_turn, seed):
     how = {"fix_sd_m": 0.6, "other_sd_m": 0.5, "stride_sd_m": 0.3, "speed_m_s": 20.0, "seed": seed}
     air = SimFlight(Navigator(1.0, 1.0), wind=WIND, **how)
     air.shows_turn = shows_turn
-    air.fly(60)
-    air.lose_gps()
+    fly_no_gps(air, 0)
     air.errors_m.clear()
     for turn in (0.05, 0.1, 0.15):
         air.turn = turn
