@@ -78,8 +78,7 @@ def answer_http(status, kind="text/plain", body=b"nothing"):
 
 
 def answer_multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connections=None):
-    """A multipart stream of all pictures in turn. The times of sending go into a list for each connection, in
-    `connections`."""
+    """A multipart stream of all pictures in turn. `connections` gets a list of times of sending for each."""
 
     def answer(connection, asked):
         read_request(asked)

@@ -70,8 +70,7 @@ def open_notify_socket(folder: Path):
 
 
 def wait_for(kind: str, log: Path, process: subprocess.Popen, count: int = 1) -> dict[str, Any]:
-    """The line of a kind in the flight log with this number, as soon as it is there. Raises RuntimeError where none
-    comes."""
+    """The line of a kind in the flight log with this number, once it is there. Raises RuntimeError if none comes."""
     give_up_s = time.monotonic() + _PATIENCE_S
     while time.monotonic() < give_up_s:
         over = process.poll() is not None

@@ -44,8 +44,7 @@ def draw_view(seed: int, height_ratio: float) -> np.ndarray:
 
 
 def render_view(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
-    """What a square camera sees over the middle of `ground`, that has turned clockwise, moved and risen so many times
-    as high."""
+    """What a square camera sees over the middle of `ground`, rotated clockwise, moved and `height` times as high."""
     middle = (np.array(ground.shape[1::-1]) - 1) / 2 + (right_px, down_px)
     view = cv2.getRotationMatrix2D(middle.tolist(), rotation_deg, 1 / height)
     view[:, 2] += (side_px - 1) / 2 - middle
@@ -53,8 +52,7 @@ def render_view(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, he
 
 
 def write_flight(folder: Path, pictures: Iterable[np.ndarray], step_deg: float = 0.001, start_s: float | None = None):
-    """Write pictures, numbered, and the table of their positions, each `step_deg` of latitude north of the one before,
-    and a second after it."""
+    """Write numbered pictures and their positions, each a second later and `step_deg` of latitude farther north."""
     folder.mkdir(parents=True)
     tags = {}
     for number, picture in enumerate(pictures):

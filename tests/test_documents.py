@@ -16,8 +16,7 @@ BLOCK = re.compile(r"^```(?:sh|text|console)?\n(.*?)^```", re.M | re.S)
 
 
 def read_commands(page: Path) -> list[str]:
-    """Return the commands of edgevpr and of the simulated autopilot in the blocks of a page, without prompts, comments
-    and continuations."""
+    """Return the commands of edgevpr and of the simulated autopilot in a page, without prompts and comments."""
     commands = []
     for block in BLOCK.findall(page.read_text("utf-8")):
         lines = block.replace("\\\n", " ").splitlines()

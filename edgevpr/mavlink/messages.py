@@ -24,7 +24,8 @@ _YAW_SD_RAD = math.radians(5.0)
 _FALLBACK_SATELLITES = 2
 _FALLBACK_SD_M = 100.0
 _FALLBACK_SD_M_S = 10.0
-_NORMAL_SATELLITES = 6  # the minimum for a filter to start
+_NORMAL_SATELLITES = 6  # the minimum for a filter to start, which also needs a dilution of precision of 2.5
+_RANGE_SD_M = 2.0  # of a receiver; multiplied by the dilution of precision (HDOP), it is the error of the position
 _GPS_EPOCH_S = 315_964_800  # 1980-01-06
 _LEAP_S = 18  # leap seconds since the GPS epoch, as of 2017
 _WEEK_S = 604_800
@@ -143,11 +144,11 @@ def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_u
     return mavlink.MAVLink_gps_input_message(
         time_usec=round(stamp_s * 1e6),
         gps_id=receiver,
-        ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP,
+        ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_VDOP,
         time_week_ms=int(time_of_week_s * 1000),
         time_week=int(week),
         fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if state else mavlink.GPS_FIX_TYPE_NO_FIX,
-        hdop=0.0,
+        hdop=sd_m / _RANGE_SD_M,
         vdop=0.0,
         satellites_visible=satellites,
         lat=round(state.lat_deg * 1e7) if state else 0,

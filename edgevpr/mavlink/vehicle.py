@@ -70,6 +70,7 @@ class PositionAccuracy:
     (PX4) or, without a report, the last known value with a drift of DRIFT_M_S added."""
 
     def __init__(self) -> None:
+        self.has_position = True  # False: the filter has reported that it has none
         self._last_known: tuple[float, float] | None = None  # standard deviation, time
         self._reported: tuple[float, float] | None = None  # standard deviation that the filter reports, time
         self._ratio: tuple[float, float] | None = None  # position innovation divided by the filter's gate, time
@@ -80,7 +81,8 @@ class PositionAccuracy:
         self._ratio = (message.pos_horiz_ratio if is_px4 else message.pos_horiz_variance), now_s
         # PX4 also sets this flag while the vehicle stands still with GPS.
         is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and not is_px4
-        if is_constant or not message.flags & _HAS_POSITION:
+        self.has_position = bool(message.flags & _HAS_POSITION) and not is_constant
+        if not self.has_position:
             self._last_known = self._reported = None  # a position is still reported, but it is outdated
         elif is_px4:
             # PX4 reports the combined value of both axes, which is a conservative value for one. 0: unknown.

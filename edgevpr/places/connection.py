@@ -145,8 +145,7 @@ class MapConnection:
                 raise
 
     def scan_rows(self, columns: str) -> Iterator[tuple[int, Values | None]]:
-        """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan_rows`). Raises
-        MapError."""
+        """Yield (place id, values of `columns` or None if unreadable) of every place. Raises MapError."""
         with translate_errors(self.path):
             yield from rows.scan_rows(self.db, columns)
 

@@ -99,8 +99,7 @@ def decode_point_or_none(geom: object) -> tuple[float, float] | None:
 
 
 def format_utc(t_utc_s: float | None) -> str | None:
-    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None or an impossible
-    time."""
+    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None if unknown or impossible."""
     if t_utc_s is None:
         return None
     try:

@@ -38,8 +38,7 @@ def read_ram_mb(root: Path = _ROOT) -> float:
 
 
 def read_ram_limit_mb(root: Path = _ROOT) -> float:
-    """Return the RAM in MB that this process may use: the machine's RAM or the lowest limit (memory.max) of its
-    cgroups."""
+    """Return the RAM in MB that this process may use: the machine's or the lowest memory.max of its cgroups."""
     return min([read_ram_mb(root), *(int(limit) / 1e6 for (limit,) in _read_cgroup_limits("memory.max", root))])
 
 

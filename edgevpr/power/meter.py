@@ -105,8 +105,7 @@ def compute_query_cost(
 
 @dataclass(frozen=True, slots=True)
 class MachineLoad:
-    """Load of the machine: the utilisation of each core, 0..1, since the last call of `measure_machine_load`, and RAM
-    in bytes."""
+    """Load of the machine: utilisation of each core, 0..1, since the last `measure_machine_load`; RAM in bytes."""
 
     core_usage: tuple[float, ...]
     ram_used_bytes: int

@@ -1,5 +1,4 @@
-"""Live sources, on real streams and on cameras that the test drives. What is asserted is what happens and in which
-order, never how fast."""
+"""Live sources, on real streams and on cameras that the test drives: what happens in which order, never how fast."""
 
 import itertools
 import socket

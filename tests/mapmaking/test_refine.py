@@ -1,5 +1,4 @@
-"""A map that refines itself: pictures of a generated flight, whose true positions are known, with noisy ones
-recorded."""
+"""A map that refines itself: pictures of a generated flight with known true positions and noisy recorded ones."""
 
 import csv
 import dataclasses

@@ -1,5 +1,4 @@
-"""Files that are no map, or a map that somebody has tampered with: one sentence, no traceback, and no reading that does
-not end."""
+"""Files that are no map, or a map that was tampered with: one sentence, no traceback, and reading always ends."""
 
 import contextlib
 import dataclasses

@@ -1,5 +1,4 @@
-"""Profiles of boards: those that come with edgevpr, the user's own, and the machine itself, from trees that stand for
-it."""
+"""Profiles of boards: those that come with edgevpr, the user's own, and this machine's, from simulated file trees."""
 
 import os
 

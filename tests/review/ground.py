@@ -52,8 +52,7 @@ def write_places(folder: Path) -> list[Place]:
 
 
 def make_flight_lines(places: list[Place], count: int) -> list[tuple[str, dict]]:
-    """The lines of a flight over the places; every third query is refused for its confidence, every fifth for a low
-    score."""
+    """The lines of a flight over the places; every third query has a low confidence, every fifth a low score."""
     lines = []
     for number in range(count):
         place, t_s = places[number % len(places)], 1001.0 + number

@@ -20,8 +20,7 @@ TECHNIQUES = {"cohog": ("w1=208",), "hog": ("w1=64",), "seqslam": ()}
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory):
-    """`seen` are the pictures with their positions, `blind` the same without any, and there is a map of each
-    technique."""
+    """`seen` are pictures with positions, `blind` the same without, and there is a map of each technique."""
     folder = tmp_path_factory.mktemp("recording")
     for name in ("seen", "blind"):
         write_flight(folder / name / "images", draw_pictures(PLACES), STEP_DEG)

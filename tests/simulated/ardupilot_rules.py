@@ -146,7 +146,10 @@ class ArduPilot(Firmware):
         return True
 
     def _wait_for_aiding(self, measured: PositionMeasurement | None) -> None:
-        self._good_since_s = math.inf if measured is None else min(self._good_since_s, self.now_s)
+        is_good = measured is not None and measured.can_align
+        self._good_since_s = min(self._good_since_s, self.now_s) if is_good else math.inf
+        if measured is not None and not is_good:
+            self._aligned_after_s = _ALIGNED_AFTER_S
         if measured is not None and self.now_s - self._good_since_s >= self._aligned_after_s:
             self._start_aiding(measured.point, measured.alt_m, self.now_s)
 

@@ -130,8 +130,7 @@ class _Conversation:
 
     def _count(self, message: Message) -> None:
         """Count a received message, and start the motion along the track if a companion does more than ask for
-        information. Choose the receiver of the answers: the last companion heard or, before there is one, any sender of
-        heartbeats."""
+        information. The last companion heard receives the answers or, before there is one, any sender of heartbeats."""
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
         self._lost_packets += (message.get_seq() - self._next_seq.get(sender, message.get_seq())) % 256
         self._next_seq[sender] = (message.get_seq() + 1) % 256

@@ -37,8 +37,7 @@ Origin = tuple[float, float, float]  # latitude, longitude, altitude above sea l
 
 class Firmware(ABC):
     """The position estimator of a vehicle, and all that edgevpr reads which depends on it. Flight modes and failsafes
-    are not simulated, since edgevpr does not see them. The estimate is kept as its error against the truth (see
-    `Estimator`)."""
+    are not simulated, since edgevpr does not see them. The estimate is kept as its error (see `Estimator`)."""
 
     number: ClassVar[int]  # MAV_AUTOPILOT
     version: ClassVar[int]
@@ -112,8 +111,7 @@ class Firmware(ABC):
         return self.truth.velocity_m_s + self.estimator.velocity_error_m_s
 
     def _innovation_m(self, point: LatLon, age_s: float = 0.0) -> complex:
-        """Return the vector from the estimate to a point that was measured `age_s` seconds ago, plus the distance flown
-        since."""
+        """Return the vector from the estimate to a point measured `age_s` ago, plus the distance flown since."""
         return displacement_m(self.truth.point, point) - self.estimator.error_m + self.velocity_m_s * age_s
 
     def _reset_to(self, point: LatLon, sd_m: float, age_s: float = 0.0) -> None:

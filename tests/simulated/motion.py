@@ -160,8 +160,7 @@ def read_track(csv_path: str | Path) -> list[TrueState]:
 
 
 def interpolate_track(track: FlownTrack, t_s: float) -> TrueState:
-    """Return the state on a track at `t_s` seconds from its start. Before and after the track the vehicle stands
-    still."""
+    """Return the state on a track at `t_s` seconds from its start. Before and after it, the vehicle stands still."""
     leg = bisect_right(track, t_s, key=lambda state: state.t_s)  # it ends at the point of this index
     passed = track[max(0, leg - 1)]
     if not 0 < leg < len(track):

@@ -31,7 +31,7 @@ _TIMEOUT_S = 4.0
 class PositionMeasurement:
     """A measured position: a point and its altitude above sea level, the standard deviation of one axis, the time `t_s`
     of its arrival, and the kind of fix (GPS_FIX_TYPE). `velocity_m_s` None: not measured. `age_s` is the age that the
-    autopilot assumes."""
+    autopilot assumes. `can_align`: it is good enough for a filter to start (NavEKF3_core::calcGpsGoodToAlign)."""
 
     point: LatLon = (0.0, 0.0)
     alt_m: float = 0.0
@@ -42,6 +42,7 @@ class PositionMeasurement:
     fix_type: int = NO_FIX
     satellites: int = 0
     age_s: float = 0.0
+    can_align: bool = True
 
 
 NOTHING = PositionMeasurement()  # of a receiver that is silent
@@ -79,6 +80,8 @@ class Receivers:
         """Process a GPS_INPUT, if it is for a receiver of type 14."""
         index = message.gps_id
         if index in (0, 1) and self._type(index) == _BY_MAVLINK:
+            hdop = math.inf if message.ignore_flags & mavlink.GPS_INPUT_IGNORE_FLAG_HDOP else message.hdop
+            is_precise = message.horiz_accuracy <= 5.0 and message.speed_accuracy <= 1.0 and hdop <= 2.5
             self.reports[index] = PositionMeasurement(
                 point=(message.lat / 1e7, message.lon / 1e7),
                 alt_m=message.alt,
@@ -89,6 +92,7 @@ class Receivers:
                 fix_type=message.fix_type,
                 satellites=message.satellites_visible,
                 age_s=self._parameters.get(f"GPS{index + 1}_DELAY_MS", 0) / 1e3 or _MAVLINK_AGE_S,
+                can_align=is_precise and message.satellites_visible >= 6,
             )
 
     def _type(self, index: int) -> float:

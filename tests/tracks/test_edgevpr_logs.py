@@ -16,8 +16,7 @@ FRAME_S = 100.0
 
 
 def make_vehicles():
-    """Reports at the time of each picture: one that counts, no report, an old one, no GPS, and a fix of ours just now
-    and long ago."""
+    """Reports at the time of each picture: one that counts, none, an old one, no GPS, our fix just now and long ago."""
     return (
         make_vehicle(50.1, 8.0, FRAME_S, roll_deg=3.0, height_m=80.0),
         None,

@@ -90,8 +90,7 @@ class Flight:
 
     @classmethod
     def open(cls, config: Config, io: FlightIO) -> "Flight":
-        """Open map, log, link and source. Raises EdgevprError, and StopNow if a signal ends the flight before it
-        begins."""
+        """Open map, log, link and source. Raises EdgevprError, and StopNow if a signal arrives meanwhile."""
         systemd.notify(EXTEND_TIMEOUT_USEC=systemd.MAX_START_US)
         with ExitStack() as stack:
             with io.stop.interrupt_start():

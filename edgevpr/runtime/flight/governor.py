@@ -90,8 +90,7 @@ class Governor:
         return f"held to {', '.join(filter(None, parts))}" if now != full else None
 
     def update(self, now_s: float, reading: LoadReading) -> Change | None:
-        """Process a measurement over one second and a whole number of queries; return the change to
-        make."""
+        """Process a measurement over one second and a whole number of queries; return the change to make."""
         is_hot, exceeded = self._check_load(reading)
         max_mb = self._board.memory_max_mb
         has_headroom = self._has_headroom(reading, self._settings[max(0, self._index - 1)])

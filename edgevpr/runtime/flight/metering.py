@@ -43,8 +43,7 @@ class FlightMeter:
         self.limit_c = self._machine.limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
 
     def measure_cost(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
-        """Return a context manager that measures wall time and CPU time: of all threads or, with `thread_only`, of this
-        one."""
+        """Return a context manager that measures wall and CPU time, with `thread_only` that of this thread alone."""
         return meter_stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
 
     def add(self, *stages: StageCost) -> None:

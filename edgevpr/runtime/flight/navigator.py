@@ -240,7 +240,7 @@ class Navigator(Listener):
         self._watch.record_sent(t_s)
         lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
         east, north = estimate.velocity_m_s
-        attitude, factor = self._attitude, self._correlation_factor(t_s)
+        attitude, factor = self._attitude, self._correlation_factor(vehicle, t_s)
         is_fallback, receiver = self.output is Output.RESERVE, vehicle.gps
         return MotionState(
             t_mono_s=t_s,
@@ -338,9 +338,12 @@ class Navigator(Listener):
         sent_deg = offset_position(position.lat_deg, position.lon_deg, *lead_m)
         return Advice(Fix(*sent_deg, math.hypot(claimed_m, math.hypot(*lead_m) / math.sqrt(2)), now_s))
 
-    def _correlation_factor(self, t_s: float) -> float:
+    def _correlation_factor(self, vehicle: Vehicle, t_s: float) -> float:
         """Return the factor for the claimed errors of a continuous position. For PX4 it is small while pictures measure
-        its attitude error, or need no attitude: then our positions do not feed back into our own errors."""
+        its attitude error, or need no attitude: then our positions do not feed back into our own errors. Nor do they
+        while the autopilot has no position; ArduPilot then needs claims below 5 m and 1 m/s for ten seconds."""
+        if not vehicle.is_estimated:
+            return 1.0
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 

@@ -153,8 +153,7 @@ def locate(
 
 
 def add_tilt_covariance(located: Located, tilt: ObservedTilt, view: View) -> Located:
-    """Return the position with its covariance increased by the effect of `tilt`, which levelling by `view` has not
-    removed."""
+    """Return the position with its covariance increased by the effect of `tilt` that remains after levelling."""
     tangent_sd = tilt.get_sd(view.is_tilt_known)
     tilt_m2 = (tangent_sd * (located.height_m or TYPICAL_FOCAL * (located.footprint_m or 0.0))) ** 2
     east_m2, cross_m2, north_m2 = located.covariance_m2
@@ -173,7 +172,7 @@ def compute_worst_sd(covariance: Doubles) -> float:
 
 
 def mahalanobis(step: Doubles, covariance: Doubles) -> float:
-    """Return the Mahalanobis distance of a shift (2,): its length in standard deviations of a covariance (2, 2)."""
+    """Return the Mahalanobis distance of a shift (n,): its length in standard deviations of a covariance (n, n)."""
     return math.sqrt(step @ np.linalg.solve(covariance, step))
 
 

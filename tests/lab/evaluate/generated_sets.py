@@ -5,8 +5,7 @@ from pictures import draw_texture
 
 
 def make_set(folder, places=6):
-    """Each query is its place, darker; one of them is not scored, one place is ignored, and the last query is off the
-    map."""
+    """Each query is its place, darker; one is not scored, one place is ignored, the last query is off the map."""
     rows = ["query_file,ref_files,ref_files_loose,status"]
     for part in ("query", "ref"):
         (folder / part).mkdir(parents=True)

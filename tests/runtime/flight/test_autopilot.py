@@ -1,5 +1,4 @@
-"""What is told to the autopilot, and that an event says what became of its fix: accepted, sent, taken are three
-things."""
+"""What the autopilot is sent, and that an event says what became of its fix: accepted, sent or taken."""
 
 import numpy as np
 import pytest

@@ -65,6 +65,20 @@ def test_receiver_of_ours_does_not_diverge_while_used_with_gps(parameters, match
     assert_no_worse("arducopter", lambda flight: None, matches=matches, **GPS_INPUT, **parameters)
 
 
+@pytest.mark.parametrize("parameters", [GPS_INPUT, ODOMETRY], ids=["GPS_INPUT", "ODOMETRY"])
+def test_copter_without_gps_uses_our_positions_again_after_a_long_gap(parameters):
+    """ArduPilot's filter stops after ten seconds, and starts with a receiver of 5 m, 1 m/s and HDOP 2.5 or better."""
+    flight = ClosedLoop("arducopter", **parameters).fly(SETTLED_S)
+    flight.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 1 + ("VISO_TYPE" in parameters))
+    flight.set("SIM_GPS1_ENABLE", 0).fly(5)
+    flight.matches = flight.sees_motion = False
+    assert flight.fly(25).brain.flags() & mavlink.EKF_CONST_POS_MODE
+    flight.matches = flight.sees_motion = True
+    again_s = flight.fly(15).now_s
+    assert flight.fly(20).worst_m(again_s)[1] < 8
+    assert not flight.brain.flags() & mavlink.EKF_CONST_POS_MODE
+
+
 @px4_channels
 def test_px4_uses_gps_again_after_flight_over_lower_ground(parameters):
     """Over ground that falls away, where strides are 1.4 times short: the position that is sent is 140 m off."""

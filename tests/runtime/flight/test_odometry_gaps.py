@@ -31,8 +31,7 @@ def measure_error_m(air):
 
 
 def measure_offsets_m(air, seconds):
-    """Metres (2,) by which we are beside the aircraft, and beside where matches put it, so long after they have begun
-    to put it 80 m off."""
+    """Metres by which we are off the aircraft, and off where matches put it, once these have been 80 m off so long."""
     air.map_off = np.array([80.0, 0.0])
     led_m, _ = measure_error_m(air.fly(seconds))
     return np.hypot(*led_m), np.hypot(*(led_m - air.map_off))

@@ -1,5 +1,4 @@
-"""The calibration that a map brings into a flight: used where it makes sense, and never a reason to stop; and the model
-of confidence in it."""
+"""The calibration of a map in flight, with its model of confidence: used if it makes sense, never a reason to stop."""
 
 import json
 import logging

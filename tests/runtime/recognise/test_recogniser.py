@@ -1,5 +1,4 @@
-"""The walk of a frame: what it gives, and that nothing which goes wrong with a frame, a place or a technique leaves
-it."""
+"""The walk of a frame: what it gives, and that no fault of a frame, a place or a technique leaves it."""
 
 import shutil
 
