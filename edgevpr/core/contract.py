@@ -153,8 +153,7 @@ class Perspective:
 
     @property
     def slope(self) -> float:
-        """Relative change of scale across the query's image, per longest side: the tangent of its tilt divided by the
-        focal length."""
+        """Relative change of scale across the query's image, per longest side: tan(tilt) divided by focal length."""
         return float(np.hypot(*self.over_place[2, :2]))
 
     @property

@@ -31,8 +31,7 @@ def list_model_folders() -> tuple[Path, ...]:
 
 
 def find_model(file: str) -> Path | None:
-    """Return the path of `file` in the first of `list_model_folders` that has it; None if none has it, or for a name
-    with "/"."""
+    """Return the path of `file` in the first of `list_model_folders` that has it; None if none has, or it has a "/"."""
     paths = (folder / file for folder in list_model_folders() if "/" not in file)
     return next((path for path in paths if path.is_file()), None)
 

@@ -133,8 +133,7 @@ def make_shot(number, t_mono_s=None):
 
 
 class Camera(Capture):
-    """A `Capture` that gives what `shots` yields, and then nothing. It hangs in the step `hangs` (pixels: for each
-    picture), until `go` is set."""
+    """A `Capture` that gives what `shots` yields. It hangs in the step `hangs` (pixels: always) until `go` is set."""
 
     def __init__(self, shots=(), hangs=None):
         self._shots, self._hangs, self.go = iter(shots), hangs, threading.Event()

@@ -79,8 +79,7 @@ def test_link_sends_no_timestamps_without_a_recent_time_from_the_autopilot(chann
 
 
 def learn(*trips, start_s=1000.0):
-    """A clock that has learnt by round trips a second apart, each (seconds to it, seconds back), from an autopilot
-    whose boot was at 600 s."""
+    """A clock that has learnt by round trips a second apart, each (seconds to it, back); its boot was at 600 s."""
     clock = AutopilotClock()
     for number, (there_s, back_s) in enumerate(trips):
         sent_s = start_s + number

@@ -100,8 +100,7 @@ class ArduPilot(Firmware):
         return OK
 
     def take_odometry(self, message: Message) -> None:
-        """Take the position of an ODOMETRY relative to the origin, unless its frames are wrong, its quality is low, or
-        VISO_TYPE is not set."""
+        """Take the position of an ODOMETRY if its frames are right, its quality is high and VISO_TYPE is set."""
         frames = (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
         is_taken = self.parameters["VISO_TYPE"] and message.quality >= self.parameters["VISO_QUAL_MIN"]
         if is_taken and (message.frame_id, message.child_frame_id) == frames:

@@ -32,8 +32,7 @@ _DEFAULT_ACCURACY_M = 50.0
 
 @dataclass(slots=True)
 class _Aid:
-    """A source of positions: `is_active` while EKF2 fuses it. The times are those of the last measurement, and of the
-    last one that was fused."""
+    """A source of positions: `is_active` while EKF2 fuses it. Times: of the last measurement and the last fused."""
 
     is_active: bool = False
     received_s: float = -math.inf

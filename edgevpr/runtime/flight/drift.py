@@ -143,10 +143,11 @@ class DriftFilter:
         roughness = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
         factor = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, roughness)) * drift.is_inertial
         random_walk = drift.acceleration_noise * (factor + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
-        turn_noise = _ODOMETRY_NOISE * (factor + _GPS_LOSS_TURN_FACTOR * self._gps_loss)
+        scale_noise = _ODOMETRY_NOISE * factor
+        turn_noise = scale_noise + _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
         noise = np.zeros(_SIZE)
         noise[:_SCALE] = np.repeat((drift.position_noise, drift.velocity_noise, random_walk, 0.0, 0.0), 2)
-        noise[_SCALE], noise[_HEADING if drift.is_inertial else _TURN] = _ODOMETRY_NOISE, turn_noise
+        noise[_SCALE], noise[_HEADING if drift.is_inertial else _TURN] = scale_noise, turn_noise
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)

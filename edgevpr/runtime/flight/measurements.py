@@ -31,14 +31,15 @@ _MAX_HEADING_CHANGE_DEG = 45.0  # largest change of the compass error between tw
 class FrameMeasurement:
     """A frame taken at `t_s`. `sd_m`: standard deviation of its position on each axis, without the error that an
     attitude error causes through `attitude_gain_s2` (see `DriftFilter`). `odometry`: motion since the previous frame
-    (None: unknown); `scale_sd`: error of its scale, where heights contradict each other.
-    `correlation_length_m`: distance beyond which the fixes of two frames have independent errors."""
+    (None: unknown); `scale_sd`: error of its scale, where heights contradict each other, and `scale_sd_after_gap` if a
+    step since the last match is missing. `correlation_length_m`: closer fixes of two frames have common errors."""
 
     t_s: float
     sd_m: float
     attitude_gain_s2: float = 0.0
     odometry: OdometryStep | None = None
     scale_sd: float = 0.0
+    scale_sd_after_gap: float = 0.0
     correlation_length_m: float = 0.0
 
 
@@ -101,7 +102,8 @@ def measure_frame(
         sd_m=sd_m,
         attitude_gain_s2=0.0 if is_unaffected else height_m / GRAVITY_M_S2,
         odometry=event.odometry,
-        scale_sd=height_ratio * max(abs(height_ratio - 1.0), height_ratio_sd),
+        scale_sd=height_ratio * height_ratio_sd,
+        scale_sd_after_gap=height_ratio * max(abs(height_ratio - 1.0), height_ratio_sd),
         correlation_length_m=_CORRELATION_LENGTH * (event.view.footprint_m or 0.0),
     )
 

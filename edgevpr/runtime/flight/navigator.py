@@ -117,8 +117,8 @@ class Navigator(Listener):
 
     def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
         """Set the ratio of visual height to the autopilot's height above ground (1.0: about equal). Odometry is scaled
-        by it. The ground may change back at any time, so the claimed error contains the deviation from 1.0 or
-        `ratio_sd`, the relative error of the ratio, if that is larger."""
+        by it. `ratio_sd` is its relative error. Where pictures miss a step, the ground may have changed back unnoticed:
+        then the claimed error contains the deviation from 1.0, if that is larger."""
         if ratio != 1.0:
             self._navigation.restart_odometry_scale(ratio - 1.0, _SCALE_TOLERANCE)
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd

@@ -17,8 +17,7 @@ def is_service() -> bool:
 
 
 def notify(**assignments: object) -> None:
-    """Send assignments, such as READY=1 or STATUS="12 places". Never raises: a flight must not end because nothing
-    reads them."""
+    """Send assignments, such as READY=1 or STATUS="12 places". Never raises, even if nothing reads them."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return

@@ -23,8 +23,7 @@ NEVER = math.inf
 
 
 def measure_queries(*queries):
-    """The figures of queries (score, rank of the first right reference), whose place is in the map unless they have a
-    third value, False."""
+    """The figures of queries (score, rank of the first right reference[, False: its place is not in the map])."""
     scores, ranks, has_match = zip(*((*query, True)[:3] for query in queries), strict=True)
     return SimpleNamespace(**compute_quality(np.array(scores), np.array(ranks), np.array(has_match)))
 

@@ -241,7 +241,8 @@ def test_frame_claims_a_height_error_shown_by_images():
     navigator.handle_frame(fake_match())
     frames = navigator._navigation.frames
     assert [frame.sd_m for frame, _ in frames] == pytest.approx([50 * FRAME_TIME_SD_S, 0.0, 50 * FRAME_TIME_SD_S])
-    assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.24, 0.3])
+    assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.12, 0.3])
+    assert [frame.scale_sd_after_gap for frame, _ in frames] == pytest.approx([0.0, 0.24, 0.3])
     assert [is_query for _, is_query in frames] == [True, False, True]
 
 

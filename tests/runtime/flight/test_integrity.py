@@ -113,8 +113,7 @@ def test_gps_watch_allows_for_the_time_of_a_frame(make_air, t_sd_s, is_wrong):
 
 @pytest.mark.parametrize("agrees_s", [0, 30])
 def test_map_that_never_agreed_with_gps_is_not_used_after_gps_loss(make_air, agrees_s):
-    """A map whose places lie 300 m beside the true ones contradicts GPS from the first match on, a receiver that is led
-    away only later."""
+    """A map that is 300 m off contradicts GPS from the first match on, a receiver that is led away only later."""
     air = make_air().fly(agrees_s)
     air.gps_off_m = np.array([300.0, 0.0])
     air.fly(30)

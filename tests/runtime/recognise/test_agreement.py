@@ -26,8 +26,7 @@ def landscape():
 
 
 def cut_picture(landscape, x, y, up_deg=0.0, scale=1.0):
-    """A picture whose middle is at (x, y) of the landscape, from a camera that is turned clockwise by `up_deg` and
-    `scale` times as high."""
+    """A picture around (x, y) of the landscape, from a camera rotated clockwise by `up_deg`, `scale` times as high."""
     turn = np.deg2rad(up_deg)
     # A pixel right in the picture is one right in the landscape, turned clockwise with the camera.
     a, b = scale * np.cos(turn), scale * np.sin(turn)
