@@ -64,8 +64,7 @@ def models(tmp_path, monkeypatch):
 
 @pytest.fixture
 def tree(tmp_path):
-    """Write files below a root, such as a machine's /proc and /sys: tree({"proc/meminfo": "..."}) -> the root. Further
-    calls change and add files."""
+    """Write files below a root, such as a machine's /proc: tree({"proc/meminfo": "..."}) -> the root. Calls add up."""
 
     def write(files):
         for name, text in files.items():

@@ -27,8 +27,7 @@ class FlightController:
     """A simulated vehicle, one of VEHICLES, that moves by `motion`. Without `gps` it has lost GPS in flight, before the
     start; with it, it loses GPS `gps_until_s` seconds after the start of its track, as a wind of 6 m/s comes up that it
     does not know. `start_utc_s` is its UTC at the start, seconds since 1970. `answers` are the replies (MAV_RESULT)
-    to the fixes received, and `reports` the functions that make its messages, by message number. `brain` is the
-    simulated firmware."""
+    to the fixes received, and `reports` make its messages, by message number. `brain` is the simulated firmware."""
 
     system_id = 1
 

@@ -32,11 +32,11 @@ class HeightWatch:
 
     @property
     def ratio(self) -> float:
-        """Visual height divided by the autopilot's, median of the last five matches; 1.0 unless all five deviate in the
-        same direction."""
+        """Visual height divided by the autopilot's, median of the last three matches; 1.0 unless five in a row deviate
+        in the same direction."""
         ratios = self._ratios
         is_wrong = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(MIN_CORRECTION_RATIO, ratios)
-        return statistics.median(ratios) if is_wrong else 1.0
+        return statistics.median(ratios[-3:]) if is_wrong else 1.0
 
     @property
     def ratio_sd(self) -> float:

@@ -45,9 +45,9 @@ _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long aft
 _MAX_BLIND_S = 5.0
 _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
-# Odometry is corrected if its scale differs by more from the height of one match, or from the median of five.
+# Odometry is corrected if its scale differs by more from the height of one match, or from the median of three.
 _MATCH_SCALE_TOLERANCE = 0.15
-_SCALE_TOLERANCE = 0.05
+_SCALE_TOLERANCE = 0.02
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them carry the information of one, so the claimed error is multiplied by this. Without it, they outweighed
 # the gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute. A

@@ -75,6 +75,8 @@ def test_height_watch_corrects_by_less_than_it_reports(watch):
     assert watch.watch.ratio == 1.0
     assert watch.update(122) == []
     assert watch.watch.ratio == pytest.approx(1.2)
+    watch.update(130, 140, 150)
+    assert watch.watch.ratio == pytest.approx(1.4), "the ground falls: two matches ago it was higher"
     watch.update(105)
     assert watch.watch.ratio == 1.0
 
