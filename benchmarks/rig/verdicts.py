@@ -153,9 +153,9 @@ def format_page(result: Row) -> str:
     return f"""# Never worse than alone
 
 A real ArduPilot or PX4 in its own simulator flies with edgevpr, and makes the same flight without it: {len(cells)} of
-{len(CELLS)} cells of the table (benchmarks/rig/cells.py: set-up, event, and the matches of the camera) are flown, and
-{len(wrong)} are worse. A copter hovers at 100 m or flies a leg, a plane circles; then the event begins, and
-{WATCH_S:.0f} s are watched.
+{len(CELLS)} cells of the table (benchmarks/rig/cells.py: set-up, event, and the matches of the camera) are flown,
+{len(wrong)} of them worse than alone. A copter hovers at 100 m or flies a leg, a plane circles; then the event begins,
+and {WATCH_S:.0f} s are watched.
 
 Largest values of that time in metres, each followed by that of the control (alone): distance of the aircraft from its
 planned path, loss of height, and error of the autopilot's estimate. Then the seconds from the return of GPS until this
