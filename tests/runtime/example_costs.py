@@ -1,5 +1,4 @@
-"""Costs in round figures of the size of cohog (exact matching of many regions) and of hog (a long vector in RAM),
-and figures of their accuracy."""
+"""Costs and accuracies in round figures, like those of cohog (many regions) and of hog (a long vector in RAM)."""
 
 from edgevpr.core.types import StageCost
 from edgevpr.runtime.preflight.probe import TechniqueCosts

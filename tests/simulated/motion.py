@@ -70,8 +70,7 @@ class Motion:
 
 class Hover(Motion):
     """A vehicle in the air that holds its *estimated* position at a target, by the tilt that its *estimated* attitude
-    shows. The target is `home` or, with a velocity, moves from there in a straight line. `away_m` is the true distance
-    from the target."""
+    shows. The target is `home` or moves from there with a velocity. `away_m` is the true distance from the target."""
 
     is_known = True
     obeys_estimate = True

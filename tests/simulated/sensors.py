@@ -138,8 +138,7 @@ class Receivers:
         return 1 - self._index if other.fix_type > used.fix_type or is_more else self._index
 
     def _blend(self) -> PositionMeasurement | None:
-        """Blend both receivers, weighted by the accuracies of position and velocity that they report (GPS_BLEND_MASK 5,
-        the default); None: not possible."""
+        """Blend both receivers by the accuracies that they report (GPS_BLEND_MASK 5, the default); None: impossible."""
         one, other = self.reports
         sds = (one.sd_m, other.sd_m), (one.speed_sd_m_s, other.speed_sd_m_s)
         is_late = abs(one.t_s - other.t_s) >= _BLENDED_WITHIN_S

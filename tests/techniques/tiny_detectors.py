@@ -1,5 +1,4 @@
-"""Detectors and networks of memorability that answer alike to every picture, or with its brightness: a few hundred
-bytes of ONNX with their cards."""
+"""Tiny ONNX detectors and networks of memorability that answer alike to every picture, or with its brightness."""
 
 import hashlib
 from pathlib import Path

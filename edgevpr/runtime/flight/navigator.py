@@ -36,7 +36,7 @@ _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
 # An ArduPilot plane follows positions of any claimed error: over ground 1.4 times as far below it strayed 84 m.
 _MAX_CONTINUOUS_ERROR_M = 25.0
 # Nor is a continuous one of unknown velocity: at 13 m/s it fell 40 m behind, and took 15 s to catch up without a jump.
-_MAX_SPEED_ERROR_M_S = 3.0
+_MAX_SPEED_ERROR_M_S = 6.0  # unknown: 10; in a hover by poor gyros, without a measured tilt: up to 3
 _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long after the last match, odometry or GPS
 # From accelerations alone we know no more than the autopilot, which has them too, and dead-reckons for some seconds
 # itself. So a continuous position ends this long after the last picture with a match or odometry or, until there is

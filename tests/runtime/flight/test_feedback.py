@@ -44,6 +44,13 @@ def test_loop_is_stable_for_each_claimed_accuracy(min_accuracy_m, gyro_sd, show_
     assert away_m.max() < 4 * room_m
 
 
+def test_positions_do_not_end_while_matches_come_whose_times_are_wrong():
+    flight = ClosedLoop("px4-copter", EKF2_AGP0_CTRL=0, EKF2_EV_CTRL=1).fly(40)
+    flight.time_error_s = 0.3
+    flight.set("SIM_GPS1_ENABLE", 0).fly(75)
+    assert len(flight.positions_sent(flight.now_s - 5)) > 45
+
+
 def test_loop_diverges_if_claims_equal_match_accuracy_and_tilt_is_not_measured(monkeypatch):
     """And with gyros that are taken to be as good as they are. This is how a PX4 was lost within a minute."""
     monkeypatch.setattr(navigator, "CORRELATION_FACTOR", 1.0)

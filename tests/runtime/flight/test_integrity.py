@@ -23,8 +23,7 @@ DRIFT_DIRECTION = np.array([0.6, 0.8])
 
 
 class GpsFlight(SimFlight):
-    """A flight whose every match is told to the autopilot and to the watch over GPS, as the loop does; `news` are the
-    watch's lines of the flight log."""
+    """A flight whose matches go to the autopilot and to the watch over GPS, as in the loop; `news`: its log lines."""
 
     def __init__(self, flight_log, clock, **how):
         super().__init__(Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
