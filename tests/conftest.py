@@ -64,7 +64,8 @@ def models(tmp_path, monkeypatch):
 
 @pytest.fixture
 def tree(tmp_path):
-    """Write files below a root, such as a machine's /proc: tree({"proc/meminfo": "..."}) -> the root. Calls add up."""
+    """Write files below a root, such as a machine's /proc and /sys: tree({"proc/meminfo": "..."}) -> the root. Further
+    calls change and add files."""
 
     def write(files):
         for name, text in files.items():

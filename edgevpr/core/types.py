@@ -67,7 +67,7 @@ class Vehicle:
     `roll_deg`, `pitch_deg`: positive for right wing down and for nose up; `tilt_rate_deg_s`: rate of both together.
     `height_m`: above ground; `height_doubt_m`: by how much its sources disagree. `velocity_m_s`: over ground (east,
     north). `sink_m_s`: velocity down. `innovation_ratio`: innovation of measured positions over the filter's gate;
-    above 1 the filter refuses them. `is_estimated`: the filter has a position. `gps`: newest receiver position, near
+    above 1 the filter refuses them. `has_position`: the filter has a position. `gps`: newest receiver position, near
     the estimate or not (None: none is recent). `t_fix_s`: time of the newest fix from edgevpr that may already affect
     the position (-inf: none does)."""
 
@@ -84,7 +84,7 @@ class Vehicle:
     height_doubt_m: float = 0.0
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
-    is_estimated: bool = True
+    has_position: bool = True
     position_sd_m: float | None = None
     innovation_ratio: float | None = None
     gps: Receiver | None = None

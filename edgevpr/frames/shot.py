@@ -91,7 +91,8 @@ class StreamFacts:
 
 
 class Capture:
-    """Base class of open cameras and streams. One thread uses it; other threads may only call `cancel`."""
+    """Base class of open cameras and streams. One thread uses it from opening to release; other threads may only call
+    `cancel`."""
 
     @property
     def facts(self) -> StreamFacts | None:

@@ -99,7 +99,8 @@ class Orthophoto:
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))
 
     def _find_colour_bands(self) -> list[int]:
-        """Return the numbers (from 1) of bands blue, green and red, or grey. Closes a bad file; raises SourceError."""
+        """Return the band numbers (from 1) of blue, green and red, or of grey. Closes an unusable file and raises
+        SourceError."""
         interpretations, dtypes = self._data.colorinterp, self._data.dtypes
         colours = [interpretations.index(colour) + 1 for colour in _COLOURS if colour in interpretations]
         others = [number for number, kind in enumerate(interpretations, start=1) if kind != ColorInterp.alpha]

@@ -298,7 +298,7 @@ class Autopilot:
             gps=gps,
             height_m=self.heights.compute_height_m(now_s),
             height_doubt_m=self.heights.doubt_m,
-            is_estimated=self.accuracy.has_position,
+            has_position=self.accuracy.has_position,
             position_sd_m=self.accuracy.compute_sd_m(now_s),
             innovation_ratio=self.accuracy.innovation_ratio(now_s),
         )

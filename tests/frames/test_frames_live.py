@@ -1,4 +1,5 @@
-"""Live sources, on real streams and on cameras that the test drives: what happens in which order, never how fast."""
+"""Live sources, on real streams and on cameras that the test drives. What is asserted is what happens and in which
+order, never how fast."""
 
 import itertools
 import socket
@@ -133,7 +134,8 @@ def make_shot(number, t_mono_s=None):
 
 
 class Camera(Capture):
-    """A `Capture` that gives what `shots` yields. It hangs in the step `hangs` (pixels: always) until `go` is set."""
+    """A `Capture` that gives what `shots` yields, and then nothing. It hangs in the step `hangs` (pixels: for each
+    picture), until `go` is set."""
 
     def __init__(self, shots=(), hangs=None):
         self._shots, self._hangs, self.go = iter(shots), hangs, threading.Event()

@@ -74,7 +74,8 @@ INERTIAL = Drift(
     velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02,
     is_inertial=True, heading_sd=0.05,
 )  # fmt: skip
-INERTIAL_PX4 = replace(INERTIAL, heading_sd=0.15, attitude_follows_positions=True)  # up to 20 degrees in its simulator
+# In its simulator PX4's heading is up to 20 degrees wrong.
+INERTIAL_PX4 = replace(INERTIAL, heading_sd=0.15, attitude_follows_positions=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +200,8 @@ class DriftFilter:
         The motion shows later whether the camera or the compass is rotated."""
         if abs(rotation) > _MAX_ROTATION_RAD:
             return
-        matrix = np.eye(_SIZE)[[_TURN]] + np.eye(_SIZE)[[_HEADING]]
+        matrix = np.zeros((1, _SIZE))
+        matrix[0, _TURN] = matrix[0, _HEADING] = 1.0
         error, variance = np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]])
         if mahalanobis(error - matrix @ self._x, matrix @ self._p @ matrix.T + variance) > _MAX_ROTATION_SIGMA:
             self._p[_HEADING, _HEADING] += self._drift.heading_sd**2

@@ -13,6 +13,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 MIN_CONTRADICTION_RATIO = 1.25
 MIN_CORRECTION_RATIO = 1.1  # a larger error is corrected; five matches scatter by less
 MATCHES_IN_A_ROW = 5
+_NEWEST_MATCHES = 3  # over rising or falling ground the median of all five would be two matches old
 _GROUND_CHANGE = 0.3  # further change of rising or falling ground between matches, as a fraction of the height
 MIN_HEIGHT_M = 1.0  # lower heights, as on the ground, are raised to this before comparing
 
@@ -36,7 +37,7 @@ class HeightWatch:
         in the same direction."""
         ratios = self._ratios
         is_wrong = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(MIN_CORRECTION_RATIO, ratios)
-        return statistics.median(ratios[-3:]) if is_wrong else 1.0
+        return statistics.median(ratios[-_NEWEST_MATCHES:]) if is_wrong else 1.0
 
     @property
     def ratio_sd(self) -> float:

@@ -212,7 +212,7 @@ class Navigation:
             odometry = OdometryMeasurement(moved_m, moved_m - (point.position_m - before.position_m), step.sd_m)
         is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.attitude_gain_s2, frame.sd_m, odometry)
         if step and odometry and is_used:
-            self._odometry_since_fix.add(odometry.moved_m, step, frame)
+            self._odometry_since_fix.add(step, frame)
             self._last_odometry_s = frame.t_s
 
     def predict_fix(self, match: PositionedMatch) -> PredictedFix | None:
@@ -303,12 +303,12 @@ class _OdometrySinceFix:
         self._moved_m, self._zoom, self._last_s = np.zeros(2), 0.0, last_fix_s
         self._has_gap, self._misses_step, self._scale_sd = False, False, 0.0
 
-    def add(self, moved_m: Doubles, step: OdometryStep, frame: FrameMeasurement) -> None:
-        """Add the odometry of a frame: `moved_m` (2,) metres since the previous frame."""
+    def add(self, step: OdometryStep, frame: FrameMeasurement) -> None:
+        """Add the step of odometry that led to a frame."""
         self._has_gap |= frame.t_s - self._last_s > _MAX_ODOMETRY_GAP_S
         self._misses_step |= step.from_s > self._last_s
         self._scale_sd = max(self._scale_sd, frame.scale_sd_after_gap if self._misses_step else frame.scale_sd)
-        self._moved_m, self._zoom, self._last_s = self._moved_m + moved_m, self._zoom + step.zoom, frame.t_s
+        self._moved_m, self._zoom, self._last_s = self._moved_m + step.moved_m, self._zoom + step.zoom, frame.t_s
 
     @property
     def error_m(self) -> float:

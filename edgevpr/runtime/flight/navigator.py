@@ -342,7 +342,7 @@ class Navigator(Listener):
         """Return the factor for the claimed errors of a continuous position. For PX4 it is small while pictures measure
         its attitude error, or need no attitude: then our positions do not feed back into our own errors. Nor do they
         while the autopilot has no position; ArduPilot then needs claims below 5 m and 1 m/s for ten seconds."""
-        if not vehicle.is_estimated:
+        if not vehicle.has_position:
             return 1.0
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR

@@ -178,9 +178,7 @@ def test_odometry_claims_the_error_of_unknown_terrain(zoom, gap_s, least_m, most
         stride = OdometryStep(
             from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom
         )
-        flown.navigation._odometry_since_fix.add(
-            np.array([10.0, 0.0]), stride, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, odometry=stride)
-        )
+        flown.navigation._odometry_since_fix.add(stride, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, odometry=stride))
         assert number or flown.navigation.estimate_state(flown.t_s)
     assert least_m <= flown.navigation._odometry_since_fix.error_m <= most_m
 

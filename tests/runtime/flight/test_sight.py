@@ -27,7 +27,8 @@ class SightFlight:
         self.clock, self.link, self.sight = clock, link, MapCoverageWatch(notifier)
 
     def query(self, outcomes: str, every_s: float = 1.0):
-        """`+` accepted, `-` not, `L` lost, `0` shows nothing, `x` failed, `t` tilted, `n` skipped, `u` no query."""
+        """`+` accepted, `-` not, `L` not and lost, `0` shows nothing, `x` failed, `t` tilted, `n` not worth a search,
+        `u` no query."""
         for outcome in outcomes:
             self.clock.now_s += every_s
             self.sight.update(

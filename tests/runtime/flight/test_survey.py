@@ -58,7 +58,8 @@ def fly_line(t_s):
 
 
 def make_matches(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said):
-    """The matches of a flight, one a second, with a GPS whose error lasts, and a compass wrong by `compass_deg`."""
+    """The matches of a flight, one a second, with a GPS whose error lasts; `wrong` is the share of wrong ones. The
+    compass is wrong by `compass_deg`."""
     rng, gps_off_m = np.random.default_rng(seed), np.zeros(2)
     for t_s in map(float, range(seconds)):
         at_m, heading_deg = way(t_s)
