@@ -8,10 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import sklearn.metrics
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import list_names, read_truth
@@ -87,6 +85,8 @@ def test_pcu_of_the_slowest_technique_is_its_precision():
 
 @pytest.mark.parametrize(("right", "of"), [(0, 1), (0, 20), (13, 20), (20, 20)])
 def test_wilson_interval_equals_published_values(right, of):
+    from scipy import stats
+
     expected = stats.binomtest(right, of).proportion_ci(method="wilson")
     assert wilson_interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
 
@@ -99,6 +99,8 @@ QUERIES = st.lists(st.tuples(st.integers(-3, 3), st.sampled_from([0.0, 1.0, 7.0,
 @settings(deadline=None)
 @given(QUERIES)
 def test_compute_figures_equal_those_of_scikit_learn(queries):
+    import sklearn.metrics  # takes a second, which every process of the tests would spend to collect this file
+
     scores, ranks = (np.array(column, float) for column in zip(*queries, strict=True))
     right = ranks == 0
     found = compute_figures(scores, ranks, np.isfinite(ranks))
