@@ -3,6 +3,8 @@ readiness to accept a fix, with the likely reasons for its answers. The reasons 
 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
 
 import math
+from bisect import bisect_left, bisect_right
+from operator import attrgetter
 from typing import NamedTuple
 
 from edgevpr.core.geodesy import wrap_deg
@@ -11,6 +13,7 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 _HISTORY_S = 3.0  # length of the attitude history: frames are rarely older when they are recognised
 _MAX_ATTITUDES = 200
+_get_time_s = attrgetter("t_s")
 _MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and the frame that uses it
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
 # four times as fast, which is four standard deviations.
@@ -47,14 +50,18 @@ class Attitudes:
         """Add the attitude of an ATTITUDE message; ignore one that is not finite."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
-            recent = [past for past in self._history[1 - _MAX_ATTITUDES :] if now_s - past.t_s <= _HISTORY_S]
-            self._history = (*recent, Attitude(now_s, *map(math.degrees, radians)))
+            recent = self._history[1 - _MAX_ATTITUDES :]
+            first = bisect_left(recent, now_s - _HISTORY_S, key=_get_time_s)
+            self._history = (*recent[first:], Attitude(now_s, *map(math.degrees, radians)))
 
     def interpolate(self, t_s: float) -> Attitude | None:
         """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; a single neighbour is returned.
         None if there is no neighbour."""
-        neighbours = [attitude for attitude in self._history if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
-        before = next((attitude for attitude in reversed(neighbours) if attitude.t_s <= t_s), None)
+        history = self._history  # of this moment: another thread adds to it
+        index = bisect_right(history, t_s, key=_get_time_s)
+        nearest = history[max(0, index - 1) : index + 1]
+        neighbours = [attitude for attitude in nearest if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
+        before = next((attitude for attitude in neighbours if attitude.t_s <= t_s), None)
         after = next((attitude for attitude in neighbours if attitude.t_s > t_s), None)
         if before is None or after is None:
             return before or after

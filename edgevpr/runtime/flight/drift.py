@@ -37,6 +37,8 @@ _MAX_ROTATION_SIGMA = 3.0  # a larger change: the autopilot has corrected its he
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
 _SIZE = 13
 _EYE = np.eye(2)
+_IDENTITY = np.eye(_SIZE)
+_DIAGONAL = np.diag_indices(_SIZE)
 _SCALE = 10
 _TURN = 11
 _HEADING = 12
@@ -130,7 +132,7 @@ class DriftFilter:
 
     def predict(self, step_s: float, acceleration_m_s2: Doubles) -> None:
         """Predict the state `step_s` seconds later; `acceleration_m_s2` (2,): the mean one of an inertial path."""
-        move = np.eye(_SIZE)
+        move = _IDENTITY.copy()
         move[_C, _S] = step_s * _EYE
         if self._drift.is_inertial:
             move[_C, _B] = step_s**2 / 2 * _EYE
@@ -147,10 +149,11 @@ class DriftFilter:
         scale_noise = _ODOMETRY_NOISE * factor
         turn_noise = scale_noise + _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
         noise = np.zeros(_SIZE)
-        noise[:_SCALE] = np.repeat((drift.position_noise, drift.velocity_noise, random_walk, 0.0, 0.0), 2)
+        noise[_C], noise[_S], noise[_B] = drift.position_noise, drift.velocity_noise, random_walk
         noise[_SCALE], noise[_HEADING if drift.is_inertial else _TURN] = scale_noise, turn_noise
         self._x = move @ self._x
-        self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
+        self._p = move @ self._p @ move.T
+        self._p[_DIAGONAL] += step_s * noise**2
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
 
     def lose_gps(self) -> None:
@@ -181,7 +184,7 @@ class DriftFilter:
         if odometry is None:
             self._begin_frame()
             return True
-        (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, np.eye(_SIZE)
+        (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, _IDENTITY.copy()
         transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
         transition[_F, _HEADING] = transition[_F, _TURN]
         x, p = transition @ self._x, transition @ self._p @ transition.T
@@ -260,7 +263,7 @@ class DriftFilter:
     def _begin_frame(self) -> None:
         """Set `f` to the aircraft's offset when the last frame was taken."""
         position, variance_m2 = self._frame
-        transition = np.eye(_SIZE)
+        transition = _IDENTITY.copy()
         transition[_F] = position
         self._x, self._p = transition @ self._x, transition @ self._p @ transition.T
         self._p[_F, _F] += variance_m2 * _EYE
@@ -269,7 +272,7 @@ class DriftFilter:
         """Do a Kalman update with the measurement matrix `matrix` (n, 13) and the values `measured` (n,)."""
         gain = np.linalg.solve(matrix @ self._p @ matrix.T + covariance, matrix @ self._p).T
         self._x = self._x + gain @ (measured - matrix @ self._x)
-        ikh = np.eye(_SIZE) - gain @ matrix  # I - K H
+        ikh = _IDENTITY - gain @ matrix  # I - K H
         self._p = ikh @ self._p @ ikh.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
     def _make_position_jacobian(self, age_s: float, attitude_gain_s2: float) -> Doubles:
