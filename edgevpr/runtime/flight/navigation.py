@@ -24,6 +24,7 @@ _GPS_CORRELATION_FACTOR = 2.0
 _GPS_VELOCITY_SD_M_S = 0.3
 _UNKNOWN_POSITION_SD_M = 1e4
 _UNKNOWN_VELOCITY_SD_M_S = 10.0  # while only a fix is known
+_NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
 _MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
 # Between matches the ground may rise or fall, which makes the scale of odometry wrong. The zooms between successive
@@ -58,16 +59,18 @@ class Navigation:
     Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions, also
     from those sent before edgevpr was restarted: such a path starts only at a receiver or a match, and GPS is the
     position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS contradicts our
-    position, and no recent match proves it. `last_gps_s`, `last_fix_s`: when a GPS position or a match was last used
-    (-inf: never)."""
+    position, and no recent match proves it. `is_confirmed`: False after a start at a match, until a second one agrees.
+    `last_gps_s`, `last_fix_s`: when a GPS position or a match was last used (-inf: never)."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
         self._path: Path | None = None
+        self._unplaced_path: Path | None = None  # the last accelerations, while the position is unknown
         self._filter = DriftFilter(drift, map_sd_m)
         self._frame_point: Point | None = None  # of the path, when the last frame was taken
         self._last_fix_m: Doubles | None = None  # (2,) from the origin of the path
         self.has_gps = self.is_in_doubt = False
+        self.is_confirmed = True
         self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
         self._odometry_since_fix = _OdometrySinceFix()
@@ -195,8 +198,14 @@ class Navigation:
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
-        if (path := self._valid_path) and self._drift.is_inertial:
+        if not self._drift.is_inertial:
+            return
+        if path := self._valid_path:
             self._filter.predict(path.add_acceleration(t_s, acceleration_m_s2), acceleration_m_s2)
+            return
+        if self._unplaced_path is None or self._unplaced_path.is_broken:
+            self._unplaced_path = Path(_NOWHERE, t_s, np.zeros(2))
+        self._unplaced_path.add_acceleration(t_s, acceleration_m_s2)
 
     def add_frame(self, frame: FrameMeasurement, is_query: bool = True) -> None:
         """Process a frame, whether it was recognised or not; one that is not a query only provides odometry."""
@@ -233,8 +242,10 @@ class Navigation:
         """Correct our position by a fix that `Consistency` has accepted with this verdict."""
         match = fix.match
         if self._path and verdict.restarts_path and self._drift.is_inertial:
-            self.start_at_fix(match.position, compute_worst_sd(match.scatter_m2), match.t_s, self._path.now.t_s)
+            self.start_at_fix(match)
+            self.is_confirmed = True
         elif self._path:
+            self.is_confirmed = True
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
@@ -255,13 +266,20 @@ class Navigation:
         distance_m = float(np.hypot(*(fix_m - last_fix_m)))
         return max(1.0, length_m / max(distance_m, length_m / _MAX_REPETITION_FACTOR))
 
-    def start_at_fix(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
-        """Start the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
-        frame was taken at `t_s`; `sd_m` is its standard deviation. Only an inertial path can start at a fix."""
-        if self._drift.is_inertial:
-            sd_m = math.hypot(sd_m, _UNKNOWN_VELOCITY_SD_M_S * (now_s - t_s))
-            self._start(position, sd_m, np.zeros(2), now_s, _UNKNOWN_VELOCITY_SD_M_S)
-            self.last_fix_s = t_s
+    def start_at_fix(self, match: PositionedMatch) -> None:
+        """Start the path at a match, when neither position nor velocity is known. Only an inertial path can start so,
+        and only if accelerations are known since the frame was taken: the next frame may have been taken already."""
+        known_path = self._valid_path or self._unplaced_path
+        path = known_path.restart(match.position, match.t_s) if known_path and self._drift.is_inertial else None
+        if path is None:
+            return
+        self._place(path, _UNKNOWN_POSITION_SD_M, _UNKNOWN_VELOCITY_SD_M_S)
+        age_s = path.now.t_s - match.t_s
+        self._filter.predict(age_s, path.now.velocity_m_s / age_s if age_s else np.zeros(2))
+        self.add_frame(match.frame, is_query=False)
+        if fix := self.predict_fix(match):
+            self.correct_by_fix(fix)
+        self.is_confirmed = False
 
     def estimate_state(self, t_s: float) -> NavState | None:
         """Return position and velocity at `t_s`, now or in the last seconds; None if unknown."""
@@ -288,7 +306,11 @@ class Navigation:
     def _start(
         self, position: Position, sd_m: float, velocity_m_s: Doubles, t_s: float, velocity_sd_m_s: float
     ) -> None:
-        self._path, self._frame_point, self._last_fix_m = Path(position, t_s, velocity_m_s), None, None
+        self._place(Path(position, t_s, velocity_m_s), sd_m, velocity_sd_m_s)
+
+    def _place(self, path: Path, sd_m: float, velocity_sd_m_s: float) -> None:
+        self._path, self._unplaced_path = path, None
+        self._frame_point = self._last_fix_m = None
         self._filter.start(sd_m, velocity_sd_m_s)
 
     @property

@@ -29,7 +29,6 @@ from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
 from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
-from edgevpr.runtime.recognise.locate import compute_worst_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
@@ -191,9 +190,8 @@ class Navigator(Listener):
             self._navigation.restart_odometry_scale(error, _MATCH_SCALE_TOLERANCE)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
-            if self._navigation.path_velocity_m_s is None:  # otherwise the path began after this frame was taken
-                sd_m = compute_worst_sd(match.scatter_m2)
-                self._navigation.start_at_fix(match.position, sd_m, match.t_s, vehicle.t_received_s)
+            if self._navigation.path_velocity_m_s is None:  # otherwise the frame is older than the path
+                self._navigation.start_at_fix(match)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
         verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
         if verdict.reason:
@@ -300,7 +298,7 @@ class Navigator(Listener):
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.estimate_state(t_s)
         max_error_m = _MAX_CONTINUOUS_ERROR_M if self._channel.is_continuous else _MAX_ERROR_M
-        if estimate is None or estimate.accuracy_m > max_error_m:
+        if estimate is None or estimate.accuracy_m > max_error_m or not self._navigation.is_confirmed:
             return None
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:

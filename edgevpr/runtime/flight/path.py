@@ -63,6 +63,16 @@ class Path:
         step_s = max(0.0, t_s - last.t_s)
         return self.add_velocity(t_s, last.velocity_m_s + step_s * np.asarray(acceleration_m_s2, float))
 
+    def restart(self, origin: Position, t_s: float) -> "Path | None":
+        """Return the path from `t_s` on as if it had begun there at `origin`, at rest; None if it is unknown then."""
+        start = self.interpolate(t_s)
+        if start is None:
+            return None
+        path = Path(origin, t_s, np.zeros(2))
+        for point in self._points[bisect_left(self._points, t_s, key=lambda point: point.t_s) :]:
+            path.add_velocity(point.t_s, point.velocity_m_s - start.velocity_m_s)
+        return path
+
     def interpolate(self, t_s: float) -> Point | None:
         """Return the point at `t_s`, extrapolated with the last velocity. None if `t_s` is before the first
         stored point or more than a second after the last."""

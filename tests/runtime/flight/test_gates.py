@@ -36,7 +36,7 @@ class KnownNavigation:
         self.off_m, self.accuracy_m, self.drift_m_s = off_m, accuracy_m, drift_m_s
         self.last_vision_s = self.last_fix_s = NOW_S - shown_ago_s
         self.last_gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
-        self.frames, self.begun, self.contradicts_m = [], [], 0.0
+        self.frames, self.begun, self.contradicts_m, self.is_confirmed = [], [], 0.0, True
         self.add_report = self.add_acceleration = self.correct_by_fix = self.restart_odometry_scale = lambda *_: None
 
     def estimate_state(self, t_s):

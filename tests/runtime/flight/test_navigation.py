@@ -185,8 +185,15 @@ def test_odometry_claims_the_error_of_unknown_terrain(zoom, gap_s, least_m, most
 
 def test_navigation_by_accelerations_alone_starts_at_a_fix():
     flown = NavigatedFlight(0, INERTIAL, fix_sd_m=2.0)
-    assert flown.navigation.estimate_state(0.0) is None
-    flown.navigation.start_at_fix(Position(*HOME), 3.0, -1.0, 0.0)
-    assert flown.navigation.estimate_state(0.0).accuracy_m > 10, "nobody knows how fast it was"
+    navigation, match = flown.navigation, make_fix(Position(*HOME), -1.0, 3.0)
+    navigation.start_at_fix(match)
+    assert navigation.estimate_state(0.0) is None, "it may have accelerated since the frame was taken"
+    for t_s in np.arange(-60.0, 0.01, 0.1):  # by an attitude that is wrong by two degrees
+        navigation.add_acceleration(t_s, np.array([0.34, 0.0]))
+    assert navigation.estimate_state(0.0) is None
+    navigation.start_at_fix(match)
+    assert navigation.estimate_state(0.0).accuracy_m > 10, "nobody knows how fast it was"
+    assert not navigation.is_confirmed
     errors_m, _ = flown.fly(60).errors(40)
     assert norms(errors_m).max() < 6.0
+    assert navigation.is_confirmed

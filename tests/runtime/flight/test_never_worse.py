@@ -123,7 +123,7 @@ def test_odometry_over_other_ground_is_correct_once_matches_show_its_height(matc
 
 
 @pytest.mark.parametrize(("parameters", "late_s"), [(SENSOR, 0.5), (VISION, 1.3)])
-def test_restart_without_gps_sends_nothing_until_a_match(parameters, late_s):
+def test_restart_without_gps_sends_from_the_second_match(parameters, late_s):
     """The estimate comes from what was sent before. Late matches are of frames taken before the last match."""
     flight = ClosedLoop("px4-copter", velocity_m_s=13j, **parameters).fly(SETTLED_S)
     flight.late_s = late_s
@@ -131,7 +131,14 @@ def test_restart_without_gps_sends_nothing_until_a_match(parameters, late_s):
     flight.matches = False
     assert not flight.start().fly(5).positions_sent(flight.now_s - 5)
     flight.matches = True
-    assert flight.fly(6).positions_sent(flight.now_s - 1)
+    flight.fly(1).matches = False
+    assert not flight.fly(4).positions_sent(flight.now_s - 5), "a single match may be wrong"
+    flight.matches = True
+    assert flight.fly(3).positions_sent(flight.now_s - 3)[0] < flight.now_s - 1.8 + late_s
+    flight.matches = False
+    flight.start().fly(2).matches = True
+    first_s = flight.fly(4).positions_sent(flight.now_s - 6)[0] - (flight.now_s - 4)
+    assert 2 + late_s < first_s < 2.2 + late_s, "the second frame is taken before the first match arrives"
     assert flight.fly(20).worst_m(flight.now_s - 20)[1] < 8, "the first position has the velocity of two matches"
 
 
