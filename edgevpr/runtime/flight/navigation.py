@@ -59,8 +59,8 @@ class Navigation:
     Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions, also
     from those sent before edgevpr was restarted: such a path starts only at a receiver or a match, and GPS is the
     position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS contradicts our
-    position, and no recent match proves it. `is_confirmed`: False after a start at a match, until a second one agrees.
-    `last_gps_s`, `last_fix_s`: when a GPS position or a match was last used (-inf: never)."""
+    position, and no recent match proves it. `is_confirmed`: False after a start at a match, until a second one or GPS
+    agrees. `last_gps_s`, `last_fix_s`: when a GPS position or a match was last used (-inf: never)."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -192,6 +192,7 @@ class Navigation:
 
     def _record_gps(self, now_s: float) -> None:
         self.last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix(now_s)
+        self.is_confirmed = True
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         self._filter.restart_odometry_scale(error, tolerance)

@@ -166,6 +166,14 @@ def test_contradicting_receiver_does_not_overrule_recent_matches():
     assert flown.east_m == pytest.approx(0.0, abs=1.5)
 
 
+def test_receiver_confirms_a_start_at_a_fix():
+    flown = ReceiverOnly().fly(5, has_gps=False)
+    flown.navigation.start_at_fix(make_fix(Position(*HOME), flown.t_s, 1.0))
+    assert not flown.navigation.is_confirmed
+    assert flown.fly(3).navigation.is_confirmed
+    assert flown.fly(1, has_gps=False).navigation.is_confirmed
+
+
 @pytest.mark.parametrize(
     ("zoom", "gap_s", "least_m", "most_m"), [(0.0, 0.0, 0.0, 8.0), (0.04, 0.0, 20.0, 60.0), (0.0, 8.0, 15.0, 60.0)]
 )
