@@ -24,6 +24,7 @@ _GPS_CORRELATION_FACTOR = 2.0
 _GPS_VELOCITY_SD_M_S = 0.3
 _UNKNOWN_POSITION_SD_M = 1e4
 _UNKNOWN_VELOCITY_SD_M_S = 10.0  # while only a fix is known
+_MAX_PROVING_SD_M = 100.0  # a match that agrees with a rougher prediction proves nothing
 _NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
 _MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
@@ -59,8 +60,8 @@ class Navigation:
     Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions, also
     from those sent before edgevpr was restarted: such a path starts only at a receiver or a match, and GPS is the
     position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS contradicts our
-    position, and no recent match proves it. `is_confirmed`: False after a start at a match, until a second one or GPS
-    agrees. `last_gps_s`, `last_fix_s`: when a GPS position or a match was last used (-inf: never)."""
+    position, and no recent match proves it. `is_confirmed`: False after a match while the position was unknown, until
+    another one or GPS agrees. `last_gps_s`, `last_fix_s`: when GPS or a match was last used (-inf: never)."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -246,7 +247,8 @@ class Navigation:
             self.start_at_fix(match)
             self.is_confirmed = True
         elif self._path:
-            self.is_confirmed = True
+            is_predicted = compute_worst_sd(fix.covariance_m2) <= _MAX_PROVING_SD_M
+            self.is_confirmed = verdict.overrules_path or is_predicted or not self._drift.is_inertial
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
@@ -280,7 +282,6 @@ class Navigation:
         self.add_frame(match.frame, is_query=False)
         if fix := self.predict_fix(match):
             self.correct_by_fix(fix)
-        self.is_confirmed = False
 
     def estimate_state(self, t_s: float) -> NavState | None:
         """Return position and velocity at `t_s`, now or in the last seconds; None if unknown."""

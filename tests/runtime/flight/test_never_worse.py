@@ -79,6 +79,19 @@ def test_copter_without_gps_uses_our_positions_again_after_a_long_gap(parameters
     assert not flight.brain.flags() & mavlink.EKF_CONST_POS_MODE
 
 
+@pytest.mark.parametrize(("vehicle", "parameters"), [("arducopter", ODOMETRY), ("px4-copter", SENSOR)])
+def test_match_after_a_minute_without_images_needs_a_second_one(vehicle, parameters):
+    """Our prediction is so rough by then that any match agrees with it, and its velocity is rough after the first."""
+    flight = ClosedLoop(vehicle, **parameters).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(5)
+    flight.matches = flight.sees_motion = False
+    flight.fly(60).matches = True
+    flight.fly(1).matches = False
+    assert not flight.fly(2).positions_sent(flight.now_s - 3)
+    flight.matches = True
+    assert flight.fly(3).positions_sent(flight.now_s - 1)
+
+
 @px4_channels
 def test_px4_uses_gps_again_after_flight_over_lower_ground(parameters):
     """Over ground that falls away, where strides are 1.4 times short: the position that is sent is 140 m off."""
