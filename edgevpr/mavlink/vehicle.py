@@ -13,7 +13,6 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 _HISTORY_S = 3.0  # length of the attitude history: frames are rarely older when they are recognised
 _MAX_ATTITUDES = 200
-_get_time_s = attrgetter("t_s")
 _MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and the frame that uses it
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
 # four times as fast, which is four standard deviations.
@@ -23,6 +22,8 @@ MAX_FILTER_REPORT_AGE_S = 3.0  # filter reports are requested twice a second
 # EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4) have the same flags. While ArduPilot dead-reckons, it reports
 # only a position relative to the last known one (NavEKF3: absolute means measured).
 _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
+
+_get_time_s = attrgetter("t_s")
 
 
 class Attitude(NamedTuple):
@@ -57,7 +58,7 @@ class Attitudes:
     def interpolate(self, t_s: float) -> Attitude | None:
         """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; a single neighbour is returned.
         None if there is no neighbour."""
-        history = self._history  # of this moment: another thread adds to it
+        history = self._history  # read once, because another thread replaces it
         index = bisect_right(history, t_s, key=_get_time_s)
         nearest = history[max(0, index - 1) : index + 1]
         neighbours = [attitude for attitude in nearest if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]

@@ -117,7 +117,7 @@ class Navigation:
         path = self._valid_path
         if path is None:
             position = Position(vehicle.lat_deg, vehicle.lon_deg)
-            self._start(position, vehicle.position_sd_m, velocity_m_s, t_s, self._drift.velocity_sd)
+            self._start(Path(position, t_s, velocity_m_s), vehicle.position_sd_m, self._drift.velocity_sd)
             return
         self._filter.predict(path.add_velocity(t_s, velocity_m_s), np.zeros(2))
         if had_gps and not self.has_gps:
@@ -186,7 +186,7 @@ class Navigation:
         if receiver.velocity_m_s is not None:
             velocity_m_s, velocity_sd_m_s = np.array(receiver.velocity_m_s), _GPS_VELOCITY_SD_M_S
         position = Position(*extrapolate(receiver, now_s))
-        self._start(position, _GPS_CORRELATION_FACTOR * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s)
+        self._start(Path(position, now_s, velocity_m_s), _GPS_CORRELATION_FACTOR * receiver.sd_m, velocity_sd_m_s)
         self._record_gps(now_s)
         self.is_in_doubt, self._contradicted_since_s = False, None
         return True
@@ -248,7 +248,7 @@ class Navigation:
             self.is_confirmed = True
         elif self._path:
             is_predicted = compute_worst_sd(fix.covariance_m2) <= _MAX_PROVING_SD_M
-            self.is_confirmed = verdict.overrules_path or is_predicted or not self._drift.is_inertial
+            self.is_confirmed = verdict.overrules_path or is_predicted
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
@@ -273,13 +273,13 @@ class Navigation:
         """Start the path at a match, when neither position nor velocity is known. Only an inertial path can start so,
         and only if accelerations are known since the frame was taken: the next frame may have been taken already."""
         known_path = self._valid_path or self._unplaced_path
-        path = known_path.restart(match.position, match.t_s) if known_path and self._drift.is_inertial else None
+        path = known_path.restart(match.position, match.t_s) if known_path else None
         if path is None:
             return
-        self._place(path, _UNKNOWN_POSITION_SD_M, _UNKNOWN_VELOCITY_SD_M_S)
+        self._start(path, _UNKNOWN_POSITION_SD_M, _UNKNOWN_VELOCITY_SD_M_S)
         age_s = path.now.t_s - match.t_s
         self._filter.predict(age_s, path.now.velocity_m_s / age_s if age_s else np.zeros(2))
-        self.add_frame(match.frame, is_query=False)
+        self.add_frame(match.frame, is_query=False)  # its query is counted already
         if fix := self.predict_fix(match):
             self.correct_by_fix(fix)
 
@@ -305,12 +305,7 @@ class Navigation:
         _, error_m_s, _ = self._filter.estimate_errors(0.0)
         return float(error_m_s[0]), float(error_m_s[1])
 
-    def _start(
-        self, position: Position, sd_m: float, velocity_m_s: Doubles, t_s: float, velocity_sd_m_s: float
-    ) -> None:
-        self._place(Path(position, t_s, velocity_m_s), sd_m, velocity_sd_m_s)
-
-    def _place(self, path: Path, sd_m: float, velocity_sd_m_s: float) -> None:
+    def _start(self, path: Path, sd_m: float, velocity_sd_m_s: float) -> None:
         self._path, self._unplaced_path = path, None
         self._frame_point = self._last_fix_m = None
         self._filter.start(sd_m, velocity_sd_m_s)

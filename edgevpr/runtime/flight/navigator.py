@@ -298,14 +298,14 @@ class Navigator(Listener):
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.estimate_state(t_s)
         max_error_m = _MAX_CONTINUOUS_ERROR_M if self._channel.is_continuous else _MAX_ERROR_M
-        if estimate is None or estimate.accuracy_m > max_error_m or not self._navigation.is_confirmed:
+        if estimate is None or estimate.accuracy_m > max_error_m:
             return None
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
             # A channel used with GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
             is_gps_recent = self._channel.works_with_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
             is_known = t_s - last_vision_s <= _MAX_BLIND_S or is_gps_recent
-            is_known &= estimate.speed_accuracy_m_s <= _MAX_SPEED_ERROR_M_S
+            is_known &= self._navigation.is_confirmed and estimate.speed_accuracy_m_s <= _MAX_SPEED_ERROR_M_S
         else:
             is_known = t_s - max(last_vision_s, last_gps_s) <= _MAX_INTERIM_S
         return estimate if is_known else None

@@ -4,6 +4,7 @@ offsets from it at different times can be compared; the position that an autopil
 import math
 from bisect import bisect_left
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from edgevpr.core.types import Position
 
 HISTORY_S = 6.0  # a frame is at most 5 s old when it is recognised
 _MAX_STEP_S = 1.0  # after a longer gap in the reports the path is unknown
+
+_get_time_s = attrgetter("t_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +57,7 @@ class Path:
         position_m = last.position_m + step_s / 2 * (last.velocity_m_s + velocity_m_s)
         self._points.append(Point(t_s, position_m, velocity_m_s))
         if self._points[0].t_s < t_s - 2 * HISTORY_S:  # rarely, since this moves all points
-            del self._points[: bisect_left(self._points, t_s - HISTORY_S, key=lambda point: point.t_s)]
+            del self._points[: bisect_left(self._points, t_s - HISTORY_S, key=_get_time_s)]
         return step_s
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> float:
@@ -69,7 +72,7 @@ class Path:
         if start is None:
             return None
         path = Path(origin, t_s, np.zeros(2))
-        for point in self._points[bisect_left(self._points, t_s, key=lambda point: point.t_s) :]:
+        for point in self._points[bisect_left(self._points, t_s, key=_get_time_s) :]:
             path.add_velocity(point.t_s, point.velocity_m_s - start.velocity_m_s)
         return path
 
@@ -78,7 +81,7 @@ class Path:
         stored point or more than a second after the last."""
         if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _MAX_STEP_S:
             return None
-        after = bisect_left(self._points, t_s, key=lambda point: point.t_s)
+        after = bisect_left(self._points, t_s, key=_get_time_s)
         if after == len(self._points):
             last = self._points[-1]
             return Point(t_s, last.position_m + (t_s - last.t_s) * last.velocity_m_s, last.velocity_m_s)
