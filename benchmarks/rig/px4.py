@@ -104,7 +104,7 @@ class Px4(Process):
 
     def displace_gps(self, north_m: float) -> None:
         """Displace the receiver's positions to the north. Needs a parameter that README.md describes."""
-        self.link.send_parameter("SIM_GPS_OFF_N", float(north_m))
+        self.link.send_parameter("SIM_GPS_OFF_N", round(2 * north_m) / 2)  # PX4 stops if it changes while it is saved
 
     def set_wind(self, from_deg: float, speed_m_s: float) -> None:
         if from_deg != 270.0:

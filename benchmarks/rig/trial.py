@@ -38,7 +38,7 @@ class Trial(Run):
         self._repeated_actions: dict[str, Callable[[float], object]] = {}
 
     def fly(self) -> Path:
-        """Make the flight and return its folder. If it fails, run.json has the reason as `cannot`."""
+        """Make the flight and return its folder. If the aircraft cannot fly, run.json has the reason as `cannot`."""
         failure = None
         with ExitStack() as stack:
             try:
@@ -107,12 +107,12 @@ class Trial(Run):
             self._path_m = [start_m, LEG_M[1] if self._event.leaves_map else start_m]
 
     def _wait_pose(self):
-        """Return the true pose now. Raises RuntimeError if there is none for some seconds."""
+        """Return the true pose now. Raises ChildProcessError if there is none for some seconds: this is no flight."""
         for _ in range(50):
             if pose := self._truth.compute_pose(time.monotonic()):
                 return pose
             time.sleep(LOOP_STEP_S)
-        raise RuntimeError("the simulator has stopped")
+        raise ChildProcessError("the simulator has stopped")
 
     def _measure_radius_m(self) -> float:
         pose = self._wait_pose()
