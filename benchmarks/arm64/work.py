@@ -60,7 +60,7 @@ def list_query_parts(name: str, camera: str, path: str) -> Iterator[tuple[str, C
 
         yield f"{name}: encode a frame", lambda: technique.encode(picture)
         yield f"{name}: read a place", lambda: place_map.read_fine_part(index.place_ids[1])
-        yield f"{name}: glance at a place", lambda: technique.score_quickly(descriptor, fine, rotations)
+        yield f"{name}: quick score of a place", lambda: technique.score_quickly(descriptor, fine, rotations)
         yield f"{name}: compare a place in full", lambda: technique.match(descriptor, fine, rotations)
         yield f"{name}: encode, and scan {len(small)} places", lambda: scan_index(encode(small))
         yield f"{name}: encode, and scan {len(index)} places", lambda: scan_index(encode(index))
@@ -83,7 +83,7 @@ def list_landmark_parts(picture: Image) -> Iterator[tuple[str, Callable[[], obje
         return step
 
     yield "flight: landmarks of a frame", lambda: detect_landmarks(moved, None, QUERY_LANDMARKS)
-    yield "flight: the stride since the frame before", measure_step
+    yield "flight: visual odometry since the previous frame", measure_step
 
 
 def run_parts(*maps: str) -> None:

@@ -1,5 +1,5 @@
 """A flight beside other programs on the only port of the flight controller: the routers themselves, configured as
-docs/how-to/beside-other-software.md says, with the ports and addresses of the test put in."""
+docs/how-to/run-with-other-software.md says, with the ports and addresses of the test put in."""
 
 import re
 import shlex
@@ -21,7 +21,7 @@ from edgevpr.runtime.flight.flightlog import read_log
 
 pytestmark = [pytest.mark.process, pytest.mark.network]
 
-PAGE = Path(__file__).parents[3] / "docs/how-to/beside-other-software.md"
+PAGE = Path(__file__).parents[3] / "docs/how-to/run-with-other-software.md"
 EDGEVPR = 197
 needs_router = pytest.mark.skipif(
     shutil.which("mavlink-routerd") is None,
