@@ -44,7 +44,8 @@ class Pose:
 class Receiver:
     """The newest report of a GPS receiver: standard deviation `sd_m` per axis, arrival time `t_s` on the clock of the
     frames, velocity over ground (east, north), and altitude above sea level (None: unknown). `steady_for_s`: seconds
-    for which its fixes have had no gap, jump or implausible accuracy."""
+    for which its fixes have had no gap, jump or implausible accuracy. `age_at_report_s`: age of its fix when its last
+    report arrived: autopilots repeat the last fix of a lost receiver for some seconds."""
 
     lat_deg: float
     lon_deg: float
@@ -53,6 +54,7 @@ class Receiver:
     velocity_m_s: tuple[float, float] | None = None
     alt_m: float | None = None
     steady_for_s: float = math.inf
+    age_at_report_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +70,8 @@ class Vehicle:
     `height_m`: above ground; `height_doubt_m`: by how much its sources disagree. `velocity_m_s`: over ground (east,
     north). `sink_m_s`: velocity down. `innovation_ratio`: innovation of measured positions over the filter's gate;
     above 1 the filter refuses them. `has_position`: the filter has a position. `gps`: newest receiver position, near
-    the estimate or not (None: none is recent). `t_fix_s`: time of the newest fix from edgevpr that may already affect
+    the estimate or not (None: none is recent). `gps_is_silent`: reports of a receiver with a fix have stopped, so it is
+    unknown whether it still has one. `t_fix_s`: time of the newest fix from edgevpr that may already affect
     the position (-inf: none does)."""
 
     lat_deg: float
@@ -88,6 +91,7 @@ class Vehicle:
     position_sd_m: float | None = None
     innovation_ratio: float | None = None
     gps: Receiver | None = None
+    gps_is_silent: bool = False
     t_fix_s: float = -math.inf
 
     def is_fresh(self, t_mono_s: float) -> bool:

@@ -295,6 +295,10 @@ class Conversation:
         if is_silent or is_slowed or self._has_requested_continuous != is_continuous:
             self._has_requested_continuous = is_continuous
             self.send(*messages.make_report_requests(system_id, self.autopilot.firmware, is_continuous))
+        elif now_s - self.autopilot.receivers.received_s > REQUEST_INTERVAL_S:
+            self.send(*messages.make_gps_requests(system_id))
+            if vehicle and vehicle.gps_is_silent:
+                self.announce(Severity.WARNING, "GPS reports stopped: requested again", "GPS reports")
 
     def _reset(self, why: ReasonCode) -> None:
         """Start over with an autopilot that has lost its state. `why`: reason reported for the awaited fixes."""

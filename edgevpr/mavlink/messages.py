@@ -5,7 +5,7 @@ ArduPilot keeps a single timestamp correction for all messages of a link, which 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -238,8 +238,12 @@ def make_report_requests(target_system: int, firmware: int, is_continuous: bool 
     rates_hz = _rates_hz(is_continuous)
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
-    interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-    return tuple(_make_command(target_system, interval, number, 1e6 / rate_hz) for number, rate_hz in rates_hz.items())
+    return _make_interval_requests(target_system, rates_hz)
+
+
+def make_gps_requests(target_system: int) -> tuple[Message, ...]:
+    """Make the requests for the reports of the GPS receivers alone."""
+    return _make_interval_requests(target_system, _GPS_REPORTS_HZ)
 
 
 def attitude_hz(is_continuous: bool) -> int:
@@ -316,10 +320,13 @@ def make_status_text(severity: Severity, text: str) -> Message:
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
-_REPORTS_HZ = {
+_GPS_REPORTS_HZ = {
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
+    mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5,
+}
+_REPORTS_HZ = _GPS_REPORTS_HZ | {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 10,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 2,
     mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 2,
 }
@@ -340,6 +347,11 @@ _FILTER_REPORTS = {
 
 def _rates_hz(is_continuous: bool) -> dict[int, int]:
     return _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
+
+
+def _make_interval_requests(target_system: int, rates_hz: Mapping[int, int]) -> tuple[Message, ...]:
+    interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+    return tuple(_make_command(target_system, interval, number, 1e6 / rate_hz) for number, rate_hz in rates_hz.items())
 
 
 def _make_command(target_system: int, command: int, first: float, second: float = 0) -> Message:

@@ -2,8 +2,10 @@
 
 import logging
 import math
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from dataclasses import replace
+from operator import attrgetter
 from typing import NamedTuple
 
 from edgevpr.core.geodesy import distance_m, offset_position
@@ -17,7 +19,14 @@ from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Fusion
 from edgevpr.mavlink.receivers import GPS_REPORTS, GPS_TIMEOUT_S, Receivers
-from edgevpr.mavlink.vehicle import MAX_FILTER_REPORT_AGE_S, Attitude, Attitudes, PositionAccuracy, Readiness
+from edgevpr.mavlink.vehicle import (
+    HISTORY_S,
+    MAX_FILTER_REPORT_AGE_S,
+    Attitude,
+    Attitudes,
+    PositionAccuracy,
+    Readiness,
+)
 from edgevpr.mavlink.wire import Message, mavlink
 
 MAX_GPS_DISAGREEMENT_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
@@ -32,6 +41,8 @@ _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
 _ORIGIN_TIMEOUT_S = 2.0  # an autopilot that has not answered the request in this time has no origin
 _ORIGIN_REQUEST_INTERVAL_S = 10.0
 REPLACEMENT_SILENCE_S = 30.0  # a flight controller restarts within 20 s
+
+_get_time_s = attrgetter("t_received_s")
 
 log = logging.getLogger(__name__)
 
@@ -106,6 +117,9 @@ class Listener:
     def handle_channel(self, channel: Channel) -> None:
         """Handle the channel for positions when it is first chosen, and when it changes."""
 
+    def handle_no_position(self, t_s: float) -> None:
+        """Handle a report at `t_s` that the autopilot has no position."""
+
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Handle a report of the vehicle's position and velocity."""
 
@@ -148,6 +162,7 @@ class Autopilot:
         self._was_origin_missing, self._flags = False, 0
         self.pressure_alt_m: float | None = None  # barometric altitude in the standard atmosphere
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
+        self._vehicles: tuple[Vehicle, ...] = ()  # of the last six seconds
         self.attitudes, self.heights, self.accuracy = Attitudes(), Heights(self._announce), PositionAccuracy()
         self.clock, self.imu_s = AutopilotClock(), -math.inf  # when accelerations were last received
         self.px4 = Px4Fusion()
@@ -191,13 +206,19 @@ class Autopilot:
         return self._origin_s < self._origin_request_s and is_late
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, extrapolated to `t_mono_s`: see `Conversation.predict_vehicle`."""
-        vehicle, attitude = self.vehicle, self.attitudes.interpolate(t_mono_s)
-        if vehicle and vehicle.velocity_m_s and vehicle.is_fresh(t_mono_s):
+        """Return the last report before `t_mono_s`, extrapolated: see `Conversation.predict_vehicle`."""
+        history = self._vehicles  # read once, because another thread replaces it
+        if not history:
+            return None
+        vehicle = history[max(0, bisect_right(history, t_mono_s, key=_get_time_s) - 1)]
+        if not vehicle.is_fresh(t_mono_s):
+            return vehicle
+        attitude = self.attitudes.interpolate(t_mono_s)
+        if vehicle.velocity_m_s:
             east_m, north_m = ((t_mono_s - vehicle.t_received_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
             lat_deg, lon_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, east_m, north_m)
             vehicle = replace(vehicle, lat_deg=lat_deg, lon_deg=lon_deg)
-        if vehicle is None or attitude is None:
+        if attitude is None:
             return vehicle
         _, roll_deg, pitch_deg, yaw_deg, tilt_rate_deg_s = attitude
         heading_deg = None if vehicle.heading_deg is None else yaw_deg % 360
@@ -248,12 +269,14 @@ class Autopilot:
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
                 self.heights.handle(message, now_s, self.attitudes.interpolate(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
-                self.receivers.handle(message, self.clock.mono_time_s(message.time_usec / 1e6, now_s))
+                self.receivers.handle(message, self.clock.mono_time_s(message.time_usec / 1e6, now_s), now_s)
                 if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
                     self._gps_s = now_s
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
                 self._flags, self._flags_s = message.flags, now_s
                 self.accuracy.handle(message, now_s)
+                if not self.accuracy.has_position:
+                    self._listener.handle_no_position(now_s)
                 if name == "ESTIMATOR_STATUS":
                     self.px4.handle(message, now_s, self._choose_receiver(now_s), self._listener.trusts_gps())
             case "GLOBAL_POSITION_INT":
@@ -284,7 +307,8 @@ class Autopilot:
         altitudes = Altitudes(now_s, above_sea_m, message.relative_alt / 1e3, -message.vz / 100)
         self.heights.handle_altitudes(altitudes, self.is_armed is not False, math.hypot(east_m_s, north_m_s))
         if has_no_position:
-            self.vehicle = None
+            self.vehicle, self._vehicles = None, ()
+            self._listener.handle_no_position(now_s)
             return
         self.vehicle = Vehicle(
             lat_deg=lat_deg,
@@ -296,16 +320,23 @@ class Autopilot:
             t_received_s=now_s,
             has_gps=has_gps,
             gps=gps,
+            gps_is_silent=self.receivers.is_silent(now_s, self._own_report),
             height_m=self.heights.compute_height_m(now_s),
             height_doubt_m=self.heights.doubt_m,
             has_position=self.accuracy.has_position,
             position_sd_m=self.accuracy.compute_sd_m(now_s),
             innovation_ratio=self.accuracy.innovation_ratio(now_s),
         )
+        first = bisect_left(self._vehicles, now_s - HISTORY_S, key=_get_time_s)
+        self._vehicles = (*self._vehicles[first:], self.vehicle)
         self._listener.handle_vehicle(self.vehicle)
 
     def _choose_receiver(self, now_s: float) -> Receiver | None:
         """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix."""
+        return self.receivers.choose_best(now_s, self._own_report)
+
+    @property
+    def _own_report(self) -> str | None:
+        """Name of the message that reports the receiver that we simulate; None if we simulate none."""
         choice = self.selector.choice
-        own_report = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
-        return self.receivers.choose_best(now_s, own_report)
+        return GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None

@@ -13,6 +13,7 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
 GPS_TIMEOUT_S = 2.5  # reports arrive at least once a second, and one may be lost
+MAX_FIX_AGE_S = 0.7  # when its report arrives; an older one is repeated, and the autopilot dead-reckons
 DEFAULT_GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
 MAX_PLAUSIBLE_SD_M = 15.0  # a receiver with a larger standard deviation does not replace our positions
 # Time from a receiver's measurement to the timestamp of its report: 0.1 s in ArduPilot's simulator. PX4's timestamps
@@ -39,16 +40,21 @@ class Receivers:
 
     def __init__(self) -> None:
         self._tracked: dict[str, _TrackedReceiver] = {}
+        self.received_s = -math.inf  # when the last GPS_RAW_INT arrived, with or without a fix
 
-    def handle(self, message: Message, t_s: float) -> None:
-        """Process a GPS_RAW_INT or GPS2_RAW from the autopilot, whose fix is of time `t_s`."""
+    def handle(self, message: Message, t_s: float, now_s: float) -> None:
+        """Process a GPS_RAW_INT or GPS2_RAW that arrived at `now_s`, whose fix is of time `t_s`."""
         name = message.get_type()
+        if name == GPS_REPORTS[0]:
+            self.received_s = now_s
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._tracked.pop(name, None)
             return
         previous = self._tracked.get(name)
         # After a receiver is lost, its last position is still reported for some seconds, with an unchanged timestamp.
         if previous and message.time_usec and message.time_usec == previous.time_usec:
+            report = replace(previous.report, age_at_report_s=now_s - previous.report.t_s)
+            self._tracked[name] = replace(previous, report=report)
             return
         report = _to_receiver(message, t_s)
         is_plausible = report.sd_m <= MAX_PLAUSIBLE_SD_M
@@ -65,6 +71,14 @@ class Receivers:
             return None
         best = min(recent, key=lambda tracked: tracked.report.sd_m)
         return replace(best.report, steady_for_s=best.report.t_s - best.steady_since_s)
+
+    def is_silent(self, now_s: float, own: str | None = None) -> bool:
+        """Return True if the reports of the first receiver have stopped while it had a fix: another program may have
+        stopped them. An autopilot reports a lost receiver, but not a lost second one. `own`: as above."""
+        name = GPS_REPORTS[0]
+        tracked = self._tracked.get(name) if name != own else None
+        is_repeated = tracked is not None and tracked.report.age_at_report_s > MAX_FIX_AGE_S
+        return tracked is not None and not is_repeated and now_s - self.received_s > GPS_TIMEOUT_S
 
 
 def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float] | None = None) -> tuple[float, float]:

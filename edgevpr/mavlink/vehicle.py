@@ -11,8 +11,9 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
-_HISTORY_S = 3.0  # length of the attitude history: frames are rarely older when they are recognised
-_MAX_ATTITUDES = 200
+HISTORY_S = 6.0  # of reports: a frame is not used after 5 s
+_MAX_ATTITUDES = 300
+_RATE_S = 3.0  # over which the rate of attitudes is measured
 _MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and the frame that uses it
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
 # four times as fast, which is four standard deviations.
@@ -38,21 +39,21 @@ class Attitude(NamedTuple):
 
 
 class Attitudes:
-    """The attitudes of the last three seconds."""
+    """The attitudes of the last six seconds."""
 
     def __init__(self) -> None:
         self._history: tuple[Attitude, ...] = ()
 
     def rate_hz(self, now_s: float) -> float:
         """Return the rate of attitudes received in the last three seconds."""
-        return sum(now_s - attitude.t_s <= _HISTORY_S for attitude in self._history) / _HISTORY_S
+        return sum(now_s - attitude.t_s <= _RATE_S for attitude in self._history) / _RATE_S
 
     def handle(self, message: Message, now_s: float) -> None:
         """Add the attitude of an ATTITUDE message; ignore one that is not finite."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
             recent = self._history[1 - _MAX_ATTITUDES :]
-            first = bisect_left(recent, now_s - _HISTORY_S, key=_get_time_s)
+            first = bisect_left(recent, now_s - HISTORY_S, key=_get_time_s)
             self._history = (*recent[first:], Attitude(now_s, *map(math.degrees, radians)))
 
     def interpolate(self, t_s: float) -> Attitude | None:

@@ -27,7 +27,7 @@ def receive(*reports):
     """Receivers with reports (time, and what else they say)."""
     receivers = Receivers()
     for t_s, fields in reports:
-        receivers.handle(make_report(t_s, **fields), t_s)
+        receivers.handle(make_report(t_s, **fields), t_s, t_s)
     return receivers
 
 
@@ -69,6 +69,17 @@ def test_receiver_without_a_new_fix_is_gone():
     assert receive((BEGIN_S, {}), (BEGIN_S + 1.0, {"fix_type": 2})).choose_best(BEGIN_S + 1.0) is None
     without_stamps = receive((BEGIN_S, {"stamp_s": 0.0}), (BEGIN_S + 1.0, {"stamp_s": 0.0}))
     assert without_stamps.choose_best(BEGIN_S + 1.0).t_s == BEGIN_S + 1.0
+
+
+def test_receiver_whose_reports_stop_is_silent_unless_it_repeated_an_old_fix():
+    fresh = receive((BEGIN_S, {}), (BEGIN_S + 0.6, {"stamp_s": BEGIN_S}))
+    assert not fresh.is_silent(BEGIN_S + 3.0)
+    assert fresh.is_silent(BEGIN_S + 3.2)
+    assert not fresh.is_silent(BEGIN_S + 3.2, own="GPS_RAW_INT")
+    lost = receive((BEGIN_S, {}), (BEGIN_S + 0.8, {"stamp_s": BEGIN_S}))
+    assert lost.choose_best(BEGIN_S + 1.0).age_at_report_s == pytest.approx(0.8)
+    assert not lost.is_silent(BEGIN_S + 60.0)
+    assert not receive((BEGIN_S, {}), (BEGIN_S + 1.0, {"fix_type": 2})).is_silent(BEGIN_S + 60.0)
 
 
 def test_receiver_without_speed_or_accuracy_gets_typical_ones():

@@ -83,9 +83,10 @@ def test_position_is_requested_until_it_arrives(autopilot):
     assert (version.command, version.param1) == (mavlink.MAV_CMD_REQUEST_MESSAGE, 148)
     assert {command.command for command in requests} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     intervals_us = {int(command.param1): command.param2 for command in requests}
-    assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000} | dict.fromkeys((132, 136, 193), 500_000)
+    assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000, 124: 200_000} | dict.fromkeys((132, 136, 193), 500_000)
     assert all(command.target_system == 7 for command in requests)
     for _ in range(3):  # what is heard needs no asking, but the version, which it does not say
+        autopilot.gps()
         autopilot.fly_on(seconds=4, attitude_hz=10)
         assert [each.command for each in autopilot.questions()] == [mavlink.MAV_CMD_REQUEST_MESSAGE]
     asked = []
@@ -104,6 +105,26 @@ def test_position_is_requested_again_after_a_change_of_rates(autopilot):
         autopilot.fly_on(seconds=5, attitude_hz=attitude_hz)
         asked = [each.param1 for each in autopilot.questions() if each.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL]
         assert (mavlink.MAVLINK_MSG_ID_ATTITUDE in asked) is has_to_ask, attitude_hz
+
+
+def test_gps_reports_that_have_stopped_are_requested_again(autopilot):
+    autopilot.conversation.request_position()
+    autopilot.gps()
+    autopilot.questions()
+    autopilot.fly_on(seconds=5, attitude_hz=10)
+    asked = {each.param1 for each in autopilot.questions() if each.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert asked == {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GPS2_RAW}
+
+
+def test_vehicle_at_the_time_of_an_old_frame_is_that_of_then(autopilot):
+    start_s = autopilot.clock.now_s
+    for roll_deg in range(60):
+        autopilot.attitude(roll_deg, 0, 90)
+        autopilot.position(50.0 + 1e-5 * roll_deg)
+        autopilot.wait(0.1)
+    seen = autopilot.predict(start_s + 1.05)
+    assert (seen.roll_deg, seen.lat_deg) == (pytest.approx(10.5), pytest.approx(50.0001, abs=1e-7))
+    assert seen.t_received_s == pytest.approx(start_s + 1.0)
 
 
 def test_attitude_is_that_of_the_frame_time(autopilot):

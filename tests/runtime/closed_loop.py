@@ -38,7 +38,7 @@ class ClosedLoop:
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
     the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long,
     `time_error_s` by how much frames carry too late a time, and `mount_tilt_deg` by how much the camera looks east of
-    straight down. `heading_error_deg`: of the autopilot. Gyros have the noise `gyro_sd` (radians, a root second);
+    straight down. Its messages arrive `downlink_s` late. `heading_error_deg`: of the autopilot. Gyros have the noise `gyro_sd` (radians, a root second);
     matches show the error of the attitude where they `show_tilt`. `away_m` and `error_m` are, step by step, the true
     distance from the target, and that of the estimate from the truth; `sent` is all that is sent, with the times."""
 
@@ -51,7 +51,7 @@ class ClosedLoop:
         self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
         self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
         self.heading_error_deg, self.gyro_sd, self.show_tilt = 0.0, 0.0, False
-        self.away_m, self.error_m, self.sent = [], [], []
+        self.away_m, self.error_m, self.sent, self._underway, self.downlink_s = [], [], [], [], 0.0
         self._clock, self._rng, self._steps = FakeClock(), np.random.default_rng(5), 0
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._min_accuracy_m, self.conversation = min_accuracy_m, None
@@ -125,6 +125,10 @@ class ClosedLoop:
         conversation, now_s = self.conversation, self._clock.now_s
         if not conversation:
             return
+        if self.downlink_s:
+            self._underway += [(now_s + self.downlink_s, message) for message in said]
+            said = [message for due_s, message in self._underway if due_s <= now_s]
+            self._underway = [waiting for waiting in self._underway if waiting[0] > now_s]
         while True:
             if said:
                 conversation.handle(b"".join(map(self._pack, said)), now_s, None)

@@ -8,7 +8,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import move_position
 from edgevpr.core.types import Position, Receiver, Vehicle
-from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
+from edgevpr.mavlink.receivers import MAX_FIX_AGE_S, RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
 from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch
@@ -18,7 +18,6 @@ from edgevpr.runtime.recognise.locate import compute_worst_sd, mahalanobis
 from edgevpr.runtime.recognise.odometry import OdometryStep
 
 _GPS_INTERVAL_S = 1.0
-_MAX_GPS_AGE_S = 0.7  # receivers report five times a second; without new reports the autopilot dead-reckons
 # GPS errors are correlated from one second to the next, so the standard deviation is multiplied by this.
 _GPS_CORRELATION_FACTOR = 2.0
 _GPS_VELOCITY_SD_M_S = 0.3
@@ -339,5 +338,5 @@ class _OdometrySinceFix:
 
 
 def is_gps_aided(vehicle: Vehicle) -> bool:
-    """Return True if the autopilot's position is based on GPS: a receiver has a fix near it, at most 0.7 s old."""
-    return vehicle.has_gps and vehicle.gps is not None and vehicle.t_received_s - vehicle.gps.t_s <= _MAX_GPS_AGE_S
+    """Return True if the autopilot's position is based on GPS: a receiver near it has a fix, and does not repeat it."""
+    return vehicle.has_gps and vehicle.gps is not None and vehicle.gps.age_at_report_s <= MAX_FIX_AGE_S

@@ -90,7 +90,7 @@ class Navigator(Listener):
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
-        self._autopilot_since_s = self._attitude_error_s = -math.inf
+        self._autopilot_since_s = self._attitude_error_s = self._no_position_s = -math.inf
         self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
@@ -138,6 +138,10 @@ class Navigator(Listener):
         """Process the first message of an autopilot, or of its replacement, at `t_s`."""
         self._autopilot_since_s, self._vehicle = t_s, None
 
+    def handle_no_position(self, t_s: float) -> None:
+        """Process a report that the autopilot has no position."""
+        self._no_position_s = t_s
+
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of position and velocity."""
         self._vehicle = vehicle
@@ -183,15 +187,16 @@ class Navigator(Listener):
         if vehicle is None or not vehicle.is_fresh(now_s):
             return self._advise_without_report(fix, now_s)
         if vehicle.velocity_m_s is None:
-            return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
+            return _withhold(ReasonCode.NO_TELEMETRY)
         reported, located = event.vehicle or vehicle, event.located
         if located and located.height_m and reported.height_m and reported.height_m > 0:
             error = located.height_m / reported.height_m - 1.0
             self._navigation.restart_odometry_scale(error, _MATCH_SCALE_TOLERANCE)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
-            if self._navigation.path_velocity_m_s is None:  # otherwise the frame is older than the path
-                self._navigation.start_at_fix(match)
+            if self._navigation.path_velocity_m_s is not None:  # the frame is older than the path, so it proves nothing
+                return _withhold(ReasonCode.CONTINUOUS if self._channel.is_continuous else ReasonCode.NO_TELEMETRY)
+            self._navigation.start_at_fix(match)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
         verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
         if verdict.reason:
@@ -212,7 +217,7 @@ class Navigator(Listener):
             return None
         if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh(now_s):
             return None
-        if is_gps_aided(vehicle) or self._estimate(now_s) is None:
+        if is_gps_aided(vehicle) or vehicle.gps_is_silent or self._estimate(now_s) is None:
             return None
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s).fix
 
@@ -258,7 +263,7 @@ class Navigator(Listener):
         """Decide what to send now."""
         if vehicle is None:
             return Output.STARTING
-        uses_gps = is_gps_aided(vehicle)
+        uses_gps = is_gps_aided(vehicle) or vehicle.gps_is_silent
         if uses_gps and not self._channel.works_with_gps:
             return Output.GPS_IN_USE
         if estimate is None:
@@ -268,12 +273,12 @@ class Navigator(Listener):
         if self._watch.withdrawn:
             return self._watch.withdrawn
         receiver = vehicle.gps if uses_gps else None
-        if receiver is None or receiver.sd_m > MAX_PLAUSIBLE_SD_M:
+        if not uses_gps or (receiver and receiver.sd_m > MAX_PLAUSIBLE_SD_M):
             return Output.SENDING
         if self._channel is not Channel.GPS_INPUT:
             return Output.BESIDE_GPS
         was_lost = self.output in (Output.SENDING, Output.GPS_BACK)
-        if was_lost and receiver.steady_for_s < _GPS_BACK_UNTIL_S:
+        if was_lost and receiver and receiver.steady_for_s < _GPS_BACK_UNTIL_S:
             return Output.GPS_BACK if receiver.steady_for_s >= _GPS_BACK_FROM_S else Output.SENDING
         return Output.RESERVE
 
@@ -284,11 +289,11 @@ class Navigator(Listener):
         return GPS_ERROR if has_gps and not is_continuous else DEAD_RECKONING_ERROR
 
     def _advise_without_report(self, fix: Fix, now_s: float) -> Advice:
-        """Advise on a fix without a recent report: the autopilot has no position, or has not reported it yet."""
-        if self._channel.is_continuous:
-            return _withhold(ReasonCode.NO_TELEMETRY)
+        """Advise on a fix without a recent report of a position: only an autopilot that reports that it has none gets
+        it, because nothing else can show that the match is wrong."""
         since_s = max(self._autopilot_since_s, self._vehicle.t_received_s if self._vehicle else -math.inf)
-        return Advice(fix) if now_s - since_s > _REPORT_TIMEOUT_S else _withhold(ReasonCode.NO_TELEMETRY)
+        has_none = now_s - self._no_position_s <= _REPORT_TIMEOUT_S < now_s - since_s
+        return Advice(fix) if has_none and not self._channel.is_continuous else _withhold(ReasonCode.NO_TELEMETRY)
 
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
@@ -314,7 +319,7 @@ class Navigator(Listener):
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.CONTINUOUS)
-        if is_gps_aided(vehicle):  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
+        if is_gps_aided(vehicle) or vehicle.gps_is_silent:  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
             return _withhold(ReasonCode.HAS_GPS if self._trusts_gps else ReasonCode.HAS_WRONG_GPS)
         if self._distrusts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)

@@ -258,7 +258,7 @@ TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(Reas
         (Channel.COMMAND, {}, {"picture": TILTED}, 0.0, ReasonCode.NOT_BELOW_AIRCRAFT),
         (CONTINUOUS, {"t_received_s": NOW_S - 1.1}, {}, 0.0, ReasonCode.NO_TELEMETRY),
         (CONTINUOUS, {"velocity_m_s": None}, {}, 0.0, ReasonCode.NO_TELEMETRY),
-        (Channel.COMMAND, {"velocity_m_s": None}, {}, 0.0, None),
+        (Channel.COMMAND, {"velocity_m_s": None}, {}, 0.0, ReasonCode.NO_TELEMETRY),
         (CONTINUOUS, {}, {}, None, ReasonCode.CONTINUOUS),
         (Channel.COMMAND, {}, {}, None, None),
         (Channel.COMMAND, {}, {}, 500.0, ReasonCode.HELD_OFF_PATH),
@@ -282,17 +282,28 @@ def test_accuracy_of_a_fix_contains_the_error_of_its_time():
     late = replace(fake_match().frame, t_sd_s=math.hypot(FRAME_TIME_SD_S, 0.1))
     navigator.advise(fake_match(frame=late), NOW_S)
     assert navigator.accuracy_m(NOW_S) == pytest.approx(math.hypot(1.0, 5.0))
-    unheard = navigate(is_heard=False).advise(fake_match(frame=late), NOW_S)
+    unheard = navigate(is_heard=False)
+    unheard.handle_no_position(NOW_S)
+    unheard = unheard.advise(fake_match(frame=late), NOW_S)
     assert unheard.fix.accuracy_m == pytest.approx(1.5 * math.sqrt(2)), "an unknown speed is 15 m/s"
 
 
 @pytest.mark.parametrize("is_heard", [True, False])
-def test_autopilot_gets_nothing_in_its_first_five_seconds(is_heard):
+def test_match_that_nothing_judges_is_sent_only_if_the_autopilot_reports_no_position(is_heard):
     navigator = navigate(is_heard=is_heard, reports={"t_received_s": NOW_S - 5.0})
     if not is_heard:
         navigator.handle_autopilot(NOW_S - 5.0)
-    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
+    assert navigator.advise(fake_match(), NOW_S + 0.1).why.code is ReasonCode.NO_TELEMETRY
+    navigator.handle_no_position(NOW_S)
+    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.NO_TELEMETRY, "in its first five seconds"
     assert navigator.advise(fake_match(), NOW_S + 0.1).fix
+    assert navigator.advise(fake_match(), NOW_S + 5.1).fix is None, "its reports have stopped"
+
+
+def test_match_older_than_the_path_is_not_sent():
+    navigator = navigate()
+    navigator._navigation.contradicts_m, navigator._navigation.path_velocity_m_s = None, np.zeros(2)
+    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
 
 
 def test_fix_is_sent_if_it_improves_the_autopilots_position():

@@ -47,6 +47,24 @@ def test_receiver_with_few_satellites_is_not_replaced_by_ours(satellites, matche
     assert_no_worse("arducopter", lose_satellites, matches=matches, **GPS_INPUT)
 
 
+@pytest.mark.parametrize("interval_us", [1_000_000, -1], ids=["once a second", "stopped"])
+def test_good_receiver_is_not_replaced_if_its_reports_are_rare_or_stop(interval_us):
+    flight = ClosedLoop("arducopter", matches=False, **GPS_INPUT).fly(SETTLED_S)
+    flight.set("SIM_GPS1_NUMSATS", 5).fly(5)
+    flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, interval_us)
+    for _ in range(10):
+        assert flight.fly(1).navigator.output is Output.RESERVE
+
+
+def test_plane_gets_no_match_while_its_reports_are_late():
+    """Reports that are late are not used, so nothing shows that the map has led it to a place that looks alike."""
+    flight = ClosedLoop("arduplane", velocity_m_s=15j).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(8)
+    flight.downlink_s, flight.map_off_m = 2.0, 300 + 0j
+    late_s = flight.fly(2).now_s
+    assert not flight.fly(10).positions_sent(late_s)
+
+
 @with_and_without_matches
 def test_source_set_with_odometry_does_not_diverge_with_gps(matches):
     def choose_second_set(flight):
