@@ -35,6 +35,11 @@ class Channel(Enum):
         return self not in (Channel.NONE, Channel.COMMAND)
 
     @property
+    def is_untargeted(self) -> bool:
+        """True if its message names no receiver, so that every autopilot on the link uses it."""
+        return self in (Channel.GPS_INPUT, Channel.ODOMETRY, Channel.VISION)
+
+    @property
     def works_with_gps(self) -> bool:
         """True if positions are also sent while the autopilot has GPS."""
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)

@@ -73,6 +73,7 @@ class Conversation:
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
         self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
+        self._shares_link = False  # last announced state
 
     @property
     def channel(self) -> Channel:
@@ -179,6 +180,12 @@ class Conversation:
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
         if is_alive or self._was_alive is not None:
             self._was_alive = is_alive
+        shares_link = self.channel.is_untargeted and self.autopilot.identity.shares_link(now_s)
+        if shares_link != self._shares_link:
+            self._shares_link = shares_link
+            severity = Severity.WARNING if shares_link else Severity.INFO
+            text = "two autopilots on link: nothing sent" if shares_link else "one autopilot on link again"
+            self.announce(severity, text, "link")
         self.fixes.report_silence(self.autopilot.assess_readiness(now_s).silence_reason, now_s)
         while self._reports:
             self.announce(*self._reports.pop(0))
@@ -244,8 +251,12 @@ class Conversation:
         state = self.settings.listener.estimate_state(t_s := now_s - choice.lag_s)
         if self.requests.is_paused:
             state = None
-        if choice.channel in (Channel.SENSOR, Channel.VISION):
-            return autopilot.px4.make_state_message(state, choice.channel is Channel.VISION, autopilot.origin, now_s)
+        if choice.channel is Channel.SENSOR:
+            return autopilot.px4.make_state_message(state, None, system_id, now_s)
+        if autopilot.identity.shares_link(now_s):
+            return None
+        if choice.channel is Channel.VISION:
+            return autopilot.origin and autopilot.px4.make_state_message(state, autopilot.origin, system_id, now_s)
         if (stamp_s := autopilot.stamp_s(t_s)) is None:
             return None
         if choice.channel is Channel.GPS_INPUT:

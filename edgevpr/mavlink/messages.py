@@ -112,11 +112,11 @@ def make_position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: fl
     )
 
 
-def make_position_sensor(state: MotionState) -> Message:
+def make_position_sensor(state: MotionState, target_system: int) -> Message:
     """Make a GLOBAL_POSITION_SENSOR (296): a position without altitude. PX4 uses its time of arrival."""
     return mavlink.MAVLink_global_position_sensor_message(
-        target_system=0,
-        target_component=0,
+        target_system=target_system,
+        target_component=AUTOPILOT,
         id=SENSOR_ID,
         time_usec=round(state.t_mono_s * 1e6),
         processing_time=0,

@@ -41,6 +41,7 @@ _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
 _ORIGIN_TIMEOUT_S = 2.0  # an autopilot that has not answered the request in this time has no origin
 _ORIGIN_REQUEST_INTERVAL_S = 10.0
 REPLACEMENT_SILENCE_S = 30.0  # a flight controller restarts within 20 s
+_OTHER_TIMEOUT_S = 10.0  # without a heartbeat of another vehicle, the link counts as ours alone
 
 _get_time_s = attrgetter("t_received_s")
 
@@ -69,6 +70,7 @@ class Identity:
         self._configured = system_id
         self._received_s = -math.inf
         self._has_warned = False
+        self._other_s = -math.inf  # when another vehicle's autopilot was last received from the same address
         self.has_moved = False
 
     def admits(self, endpoint: Endpoint, is_heartbeat: bool, now_s: float) -> bool:
@@ -82,12 +84,18 @@ class Identity:
                 log.warning("the autopilot is now %s: %s has been silent for %.0f s", endpoint, self.current, silent_s)
                 self.has_moved = True
             self.current, self._has_warned = endpoint, False
+        if is_heartbeat and self.current and endpoint.address == self.current.address and endpoint != self.current:
+            self._other_s = now_s
         if endpoint != self.current:
             # Do not count while any sender may still become our autopilot.
             self.foreign_messages += self.current is not None or self._configured is not None
             return False
         self._received_s = now_s
         return True
+
+    def shares_link(self, now_s: float) -> bool:
+        """Return True if another vehicle's autopilot is at the same address, and receives all that we send."""
+        return now_s - self._other_s <= _OTHER_TIMEOUT_S
 
     def is_foreign(self, address: Sender | None) -> bool:
         """Return True if bytes from this address cannot come from our autopilot, which has another address."""
@@ -102,7 +110,8 @@ class Identity:
             self._has_warned = True
             ours = current or f"system {self._configured}"
             advice = "use a separate link for each vehicle, or set mavlink.system_id and restart edgevpr"
-            log.warning("another autopilot, %s, is on this link: fixes are sent to %s only; %s", endpoint, ours, advice)
+            what = "single fixes are sent to %s only, continuous positions, which all autopilots would use, not at all"
+            log.warning(f"another autopilot, %s, is on this link: {what}; %s", endpoint, ours, advice)
         is_same = current is not None and endpoint.system_id == current.system_id
         return is_same and now_s - self._received_s >= REPLACEMENT_SILENCE_S
 

@@ -45,16 +45,17 @@ class Px4Fusion:
         return self.used / count if count else None
 
     def make_state_message(
-        self, state: MotionState | None, is_vision: bool, origin: tuple[float, float, float] | None, now_s: float
+        self, state: MotionState | None, origin: tuple[float, float, float] | None, system_id: int, now_s: float
     ) -> Message | None:
-        """Make the message that sends a state (None: unknown) to PX4: message 296 or, if `is_vision`, ODOMETRY, which
-        needs the `origin` of PX4's local frame: latitude, longitude in degrees, altitude in metres."""
-        if state is None or (is_vision and origin is None):
+        """Make the message that sends a state (None: unknown) to PX4, which has this system id: ODOMETRY, relative to
+        the `origin` of PX4's local frame (latitude, longitude in degrees, altitude in metres) or, if that is None,
+        message 296."""
+        if state is None:
             return None
-        self._sent_s, self._is_vision = now_s, is_vision
-        if is_vision and origin:
-            return messages.make_vision_position(state, origin)
-        return messages.make_position_sensor(state)
+        self._sent_s, self._is_vision = now_s, origin is not None
+        return (
+            messages.make_vision_position(state, origin) if origin else messages.make_position_sensor(state, system_id)
+        )
 
     def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_trusted: bool = True) -> None:
         """Process an ESTIMATOR_STATUS. `receiver`: the best GPS receiver with a fix (None: none has a fix).

@@ -26,7 +26,8 @@ _CONTINUOUS = (Channel.SENSOR, Channel.VISION)
 _MESSAGE_296 = (Channel.SENSOR,)
 _ODOMETRY = (Channel.VISION,)
 
-_GPS_POSITION_BIT = 1  # bit of EKF2_GPS_CTRL
+_GPS_POSITION_BIT = 1  # bits of EKF2_GPS_CTRL
+_GPS_VELOCITY_BIT = 4
 _HEIGHT_FROM_VISION = 3  # value of EKF2_HGT_REF
 _MAX_SD_M = 10  # limit of the minimum error that the filter assumes for a position
 _MAX_GATE_SD = 10
@@ -51,6 +52,10 @@ _RULES = (
     recommend(_ALL_CHANNELS, "7, the default; any value with bit 1",  # gps_control.cpp, controlGnssPosFusion
         expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _GPS_POSITION_BIT)),
         "Only our positions are used, not GPS: this is for an aircraft without GPS."),
+    require(_ALL_CHANNELS, "7; with bit 1 also bit 4",  # ekf_helper.cpp, getHorizontalVelocityInnovationTestRatio
+        expect(7, "EKF2_GPS_CTRL",
+            allows=lambda value: not has_bit(value, _GPS_POSITION_BIT) or has_bit(value, _GPS_VELOCITY_BIT)),
+        "Only the velocity shows that PX4 would use GPS again, so we would never stop sending."),
     require(_ALL_CHANNELS, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
         "GPS that recovers far from our position is rejected while airspeed or optical flow is used."),
     recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _HEIGHT_FROM_VISION),

@@ -38,9 +38,10 @@ class ClosedLoop:
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
     the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long,
     `time_error_s` by how much frames carry too late a time, and `mount_tilt_deg` by how much the camera looks east of
-    straight down. Its messages arrive `downlink_s` late. `heading_error_deg`: of the autopilot. Gyros have the noise `gyro_sd` (radians, a root second);
-    matches show the error of the attitude where they `show_tilt`. `away_m` and `error_m` are, step by step, the true
-    distance from the target, and that of the estimate from the truth; `sent` is all that is sent, with the times."""
+    straight down. Its messages arrive `downlink_s` late. `heading_error_deg`: of the autopilot. Gyros have the noise
+    `gyro_sd` (radians, a root second); matches show the error of the attitude where they `show_tilt`. `away_m` and
+    `error_m` are, step by step, the true distance from the target, and that of the estimate from the truth; `sent` is
+    all that is sent, with the times."""
 
     def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, min_accuracy_m=1.0, **parameters):
         self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)

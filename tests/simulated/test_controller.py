@@ -110,7 +110,7 @@ def gps_input(north_m: float = 1.0, accuracy_m: float = 1.0, fix_type: int = 3, 
 
 def make_sensor_position(north_m: float = 0.0, eph_m: float = 1.0, slot: int = 1):
     def make(flown: Vehicle):
-        message = messages.make_position_sensor(flown.state(north_m, eph_m))
+        message = messages.make_position_sensor(flown.state(north_m, eph_m), 1)
         message.id = slot
         return message
 

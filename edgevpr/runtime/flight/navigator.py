@@ -319,7 +319,9 @@ class Navigator(Listener):
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.CONTINUOUS)
-        if is_gps_aided(vehicle) or vehicle.gps_is_silent:  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
+        if (
+            is_gps_aided(vehicle) or vehicle.gps_is_silent
+        ):  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
             return _withhold(ReasonCode.HAS_GPS if self._trusts_gps else ReasonCode.HAS_WRONG_GPS)
         if self._distrusts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)

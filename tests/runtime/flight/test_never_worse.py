@@ -56,6 +56,25 @@ def test_good_receiver_is_not_replaced_if_its_reports_are_rare_or_stop(interval_
         assert flight.fly(1).navigator.output is Output.RESERVE
 
 
+@pytest.mark.parametrize(
+    ("vehicle", "parameters"), [("arducopter", GPS_INPUT), ("px4-copter", SENSOR), ("px4-copter", VISION)]
+)
+def test_positions_without_an_address_are_not_sent_beside_another_autopilot(vehicle, parameters):
+    flight = ClosedLoop(vehicle, **parameters).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(3)
+    other = mavlink.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3).pack(mavlink.MAVLink(None, 2, 1))
+    flight.conversation.handle(other, 1000.0 + flight.now_s, None)
+    heard_s = flight.now_s
+    targets = [
+        m.target_system for t_s, m in flight.fly(9.5).sent if t_s > heard_s and m.get_type() == "GLOBAL_POSITION_SENSOR"
+    ]
+    assert bool(flight.positions_sent(heard_s)) is (parameters is SENSOR) is bool(targets)
+    assert set(targets) <= {1}
+    texts = [message.text for t_s, message in flight.sent if message.get_type() == "STATUSTEXT"]
+    assert ("edgevpr: two autopilots on link: nothing sent" in texts) is (parameters is not SENSOR)
+    assert flight.fly(2).positions_sent(flight.now_s - 1)
+
+
 def test_plane_gets_no_match_while_its_reports_are_late():
     """Reports that are late are not used, so nothing shows that the map has led it to a place that looks alike."""
     flight = ClosedLoop("arduplane", velocity_m_s=15j).fly(SETTLED_S)
