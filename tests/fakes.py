@@ -141,8 +141,8 @@ def make_output(
 
 class FakeLink:
     """A link of which nothing gets lost, to an autopilot that listens from when it has an `answer` to fixes (None: it
-    is not there) and says what `vehicle` gives. `sent` is what has left, in order; no text waits for its turn. `wish`
-    stands for a command of the ground, which gets its answer."""
+    is not there) and says what `vehicle` gives (None: that it has no position). `sent` is what has left, in order; no
+    text waits for its turn. `wish` stands for a command of the ground, which gets its answer."""
 
     def __init__(
         self,
@@ -161,6 +161,8 @@ class FakeLink:
         self._is_under_way, self._wish = False, None
 
     def take_turn(self, name: str) -> AbstractContextManager[None]:
+        if self._vehicle() is None:
+            self.listener.handle_no_position(self._clock())
         return nullcontext()
 
     def send(self, *outgoing) -> None:

@@ -155,7 +155,6 @@ class Autopilot:
     def __init__(self, component_id: int, system_id: int | None, listener: Listener, announce: Announce) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.answered_s: dict[int, float] = {}  # time of its last answer to each of our commands, by number
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # a MAV_AUTOPILOT; generic until its first heartbeat
         self._listener, self._component_id, self._announce = listener, component_id, announce
         self.heartbeat_s = -math.inf  # time of its last heartbeat through the currently open port
@@ -165,6 +164,7 @@ class Autopilot:
 
     def _reset(self) -> None:
         self.selector = ChannelSelector(self._announce)
+        self.answered_s: dict[int, float] = {}  # time of its last answer to each of our commands, by number
         self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
         self._origin_s = self._origin_request_s = self._gps_s = self._flags_s = -math.inf  # times of the last messages

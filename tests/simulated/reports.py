@@ -31,8 +31,10 @@ def _heartbeat(brain: Firmware) -> Message:
 
 
 def _position(brain: Firmware) -> Message | None:
+    """Report the position: without one ArduPilot reports 0, 0 (`send_global_position_int`), and PX4 nothing."""
     if brain.origin is None or not brain.motion.is_known:
-        return None
+        is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
+        return None if is_px4 else mavlink.MAVLink_global_position_int_message(_boot_ms(brain), *[0] * 7, _UNKNOWN_16)
     truth, (lat_deg, lon_deg), velocity_m_s = brain.truth, brain.point, brain.velocity_m_s
     ned_m_s = velocity_m_s.imag, velocity_m_s.real, -truth.climb_m_s
     return mavlink.MAVLink_global_position_int_message(

@@ -206,18 +206,25 @@ class AutopilotOutput:
         Call it once a second."""
         with self._link.take_turn("report"):
             self._link.set_health(health)
-            self._request_source_set()
+            self._request_source_set(is_paused=health is messages.Health.STANDBY)
             self._report_output()
             now_s, ram_bytes = self._clock.mono_s(), (load.ram_used_bytes, load.ram_total_bytes)
             self._link.send(messages.make_computer_status(now_s, load.core_usage, *ram_bytes, temperature_c))
 
-    def _request_source_set(self) -> None:
+    def _request_source_set(self, is_paused: bool) -> None:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
         if vehicle is None or not vehicle.is_fresh(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
-        has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
-        answered_s = stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf)
-        if number := self._source_sets.choose_set(now_s, self._navigator.has_gps, has_own, answered_s):
+        navigator, stats = self._navigator, self._link.stats()
+        is_sent = not is_paused and (navigator.output.is_sent or not self._link.channel.is_continuous)
+        number = self._source_sets.choose_set(
+            now_s,
+            has_gps=navigator.has_gps or vehicle.gps_is_silent,
+            has_receiver=vehicle.gps is not None and vehicle.gps.steady_for_s >= _MIN_GPS_GOOD_S,
+            has_own=is_sent and navigator.knows_position(now_s),
+            answered_s=stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf),
+        )
+        if number:
             text = f"requested source set {number} from the autopilot"
             self._notifier.announce(Severity.WARNING, text, topic="sources")
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
@@ -255,28 +262,33 @@ class AutopilotOutput:
 
 
 class SourceSets:
-    """Decides which source set to request from the autopilot: `no_gps` when GPS is lost or wrong and we know the
-    position, then `gps` once GPS has been good for three seconds, each until it is answered. Unless both numbers are
-    configured, none is requested."""
+    """Decides which source set to request from the autopilot: `no_gps` when GPS is lost or wrong and we send positions,
+    then `gps` once GPS has been good for three seconds, or we have sent none for as long beside a steady receiver that
+    the map contradicts. Each is requested until it is answered. Unless both numbers are configured, none is."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
         self._requested: int | None = None
         self._requested_s = math.inf
-        self._bad_s = -math.inf
+        self._bad_s = self._needless_s = -math.inf  # when GPS was last not good, and when another set was last better
 
     @property
     def are_set(self) -> bool:
         """True if both numbers are configured; `choose_set` may be called only then."""
         return self._with_gps is not None and self._without is not None
 
-    def choose_set(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
-        """Return the number of the set to request now (None: no request). `has_gps`: there is a trusted GPS; `has_own`:
-        our own position is known well enough; `answered_s`: when such a request was last answered."""
+    def choose_set(
+        self, now_s: float, *, has_gps: bool, has_receiver: bool, has_own: bool, answered_s: float
+    ) -> int | None:
+        """Return the number of the set to request now (None: no request). `has_gps`: there is a trusted GPS;
+        `has_receiver`: a receiver is steady, trusted or not; `has_own`: positions are sent; `answered_s`: when such a
+        request was last answered."""
         if not has_gps:
             self._bad_s = now_s
+        if has_own or not has_receiver:
+            self._needless_s = now_s
         number = self._without if not has_gps and has_own else None
-        if self._requested is not None and now_s - self._bad_s > _MIN_GPS_GOOD_S:
+        if self._requested is not None and now_s - min(self._bad_s, self._needless_s) > _MIN_GPS_GOOD_S:
             number = self._with_gps
         is_alive = answered_s >= self._requested_s or now_s - self._requested_s < _SOURCE_SET_RETRY_S
         if number is None or (number == self._requested and is_alive):

@@ -26,7 +26,7 @@ class AnsweringFlight(SimFlight):
 
     def __init__(self, **settings):
         super().__init__(Navigator(1.0, 1.0, is_muted=not settings.get("send_fixes", True)))
-        self.clock, self.asked = FakeClock(0.0), []
+        self.clock, self.asked, self.health = FakeClock(0.0), [], Health.ACTIVE
         self.link = FakeLink(self.clock, vehicle=lambda: self.vehicle)
         stats = self.link.stats
         self.link.stats = lambda: replace(stats(), answered_s={SET_SOURCE_SET: self.asked[-1][0]} if self.asked else {})
@@ -38,7 +38,7 @@ class AnsweringFlight(SimFlight):
             super().fly(1)
             self.clock.now_s = self.t_s
             self.link.sent.clear()
-            self.autopilot.report(Health.ACTIVE, LOAD, None)
+            self.autopilot.report(self.health, LOAD, None)
             commands = [each for each in self.link.sent if each.get_type() == "COMMAND_LONG"]
             to = {(each.command, each.target_system, each.target_component) for each in commands}
             assert to <= {(SET_SOURCE_SET, 1, 1)}
@@ -90,16 +90,36 @@ def test_source_sets_request_nothing_without_both_sets_or_in_a_dry_run(settings)
     assert flown.fly(20).numbers == []
 
 
+def choose(sets, now_s, has_gps, has_own=True, answered_s=NEVER_S, has_receiver=False):
+    return sets.choose_set(now_s, has_gps=has_gps, has_receiver=has_receiver, has_own=has_own, answered_s=answered_s)
+
+
 def test_source_sets_repeat_an_unanswered_request():
     sets = SourceSets(BOTH_SETS)
-    asked = [sets.choose_set(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER_S) for t_s in range(30)]
+    asked = [choose(sets, t_s / 2, False, answered_s=5.1 if t_s > 10 else NEVER_S) for t_s in range(30)]
     assert [t_s / 2 for t_s, number in enumerate(asked) if number == 2] == [0, 2, 4]
-    assert sets.choose_set(40.0, True, True, answered_s=5.1) == 1, "GPS is good"
-    assert sets.choose_set(43.0, True, True, answered_s=5.1) == 1, "that answer was for the other one"
+    assert choose(sets, 40.0, True, answered_s=5.1) == 1, "GPS is good"
+    assert choose(sets, 43.0, True, answered_s=5.1) == 1, "that answer was for the other one"
 
 
 def test_source_sets_request_nothing_without_a_position_of_ours():
     sets = SourceSets(BOTH_SETS)
-    assert sets.choose_set(0.0, has_gps=False, has_own=False, answered_s=NEVER_S) is None
-    assert sets.choose_set(1.0, has_gps=False, has_own=True, answered_s=NEVER_S) == 2
-    assert sets.choose_set(2.0, has_gps=False, has_own=True, answered_s=1.1) is None
+    assert choose(sets, 0.0, False, has_own=False) is None
+    assert choose(sets, 1.0, False) == 2
+    assert choose(sets, 2.0, False, answered_s=1.1) is None
+
+
+def test_source_sets_prefer_a_steady_receiver_that_the_map_contradicts_to_nothing():
+    sets = SourceSets(BOTH_SETS)
+    assert choose(sets, 0.0, False, has_receiver=True) == 2
+    for t_s, has_receiver, number in ((3.0, True, None), (3.1, False, None), (6.1, True, None), (6.2, True, 1)):
+        assert choose(sets, t_s, False, has_own=False, answered_s=0.1, has_receiver=has_receiver) == number
+
+
+def test_source_sets_request_nothing_while_paused():
+    flown = AnsweringFlight(**SETS)
+    flown.health = Health.STANDBY
+    flown.lose_gps()
+    assert flown.fly(10).numbers == []
+    flown.health = Health.ACTIVE
+    assert flown.fly(1).numbers == [2]
