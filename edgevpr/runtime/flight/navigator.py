@@ -94,7 +94,7 @@ class Navigator(Listener):
         self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
-        self._height_ratio, self._height_ratio_sd = 1.0, 0.0
+        self._height_ratio, self._height_ratio_sd, self._settled_doubt_m = 1.0, 0.0, 0.0
         self._shared_sd_m = map_sd_m  # standard deviation of the error common to the last fixes
 
     @property
@@ -117,10 +117,12 @@ class Navigator(Listener):
     def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
         """Set the ratio of visual height to the autopilot's height above ground (1.0: about equal). Odometry is scaled
         by it. `ratio_sd` is its relative error. Where pictures miss a step, the ground may have changed back unnoticed:
-        then the claimed error contains the deviation from 1.0, if that is larger."""
+        then the claimed error contains the deviation from 1.0, if that is larger. Pictures settle what the sources of
+        the autopilot's height have contradicted each other by so far."""
         if ratio != 1.0:
             self._navigation.restart_odometry_scale(ratio - 1.0, _SCALE_TOLERANCE)
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
+        self._settled_doubt_m = self._vehicle.height_doubt_m if self._vehicle else 0.0
 
     def handle_channel(self, channel: Channel) -> None:
         """Set the channel through which positions are sent. With a continuous one, the autopilot's velocity comes from
@@ -298,6 +300,9 @@ class Navigator(Listener):
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
         ratio, ratio_sd = self._height_ratio, self._height_ratio_sd
+        if vehicle and vehicle.height_m and vehicle.height_m > 0:
+            doubt_m = max(0.0, vehicle.height_doubt_m - self._settled_doubt_m)
+            ratio_sd = math.hypot(ratio_sd, doubt_m / vehicle.height_m)
         return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_ratio_sd=ratio_sd)
 
     def _estimate(self, t_s: float) -> NavState | None:

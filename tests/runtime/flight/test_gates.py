@@ -246,6 +246,17 @@ def test_frame_claims_a_height_error_shown_by_images():
     assert [is_query for _, is_query in frames] == [True, False, True]
 
 
+def test_frame_claims_a_contradiction_of_height_sources_until_a_match_shows_the_height():
+    navigator = navigate()
+    for jumped_m in (30.0, 50.0):
+        event = fake_match(vehicle=make_vehicle(*HOME, NOW_S, height_m=100.0, height_doubt_m=jumped_m))
+        navigator.handle_frame(event)
+        navigator.handle_vehicle(event.vehicle)
+        navigator.correct_height(1.0)
+        navigator.handle_frame(event)
+    assert [frame.scale_sd for frame, _ in navigator._navigation.frames] == pytest.approx([0.3, 0.0, 0.2, 0.0])
+
+
 CONTINUOUS = Channel.GPS_INPUT
 TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
 
