@@ -332,8 +332,10 @@ def test_fix_is_sent_if_it_improves_the_autopilots_position():
 
 
 def test_navigator_sends_no_fix_with_gps_or_while_the_map_contradicts_it():
-    beside, doubted, unknown = (navigate(off_m=(10.0, 0.0), reports=said) for said in (GPS, {}, {}))
+    silent = {"gps_is_silent": True}
+    beside, unheard, doubted, unknown = (navigate(off_m=(10.0, 0.0), reports=said) for said in (GPS, silent, {}, {}))
     assert beside.advise(fake_match(), NOW_S).why.code is ReasonCode.HAS_GPS
+    assert unheard.advise(fake_match(), NOW_S).why.code is ReasonCode.HAS_GPS
     beside.trust_gps(False)
     assert beside.advise(fake_match(), NOW_S).why.code is ReasonCode.HAS_WRONG_GPS
     doubted.distrust_map(True)
@@ -351,6 +353,7 @@ def test_navigator_sends_no_fix_with_gps_or_while_the_map_contradicts_it():
         {"reports": {"velocity_m_s": None}},
         {"reports": {"t_received_s": NOW_S - 1.1}},
         {"reports": GPS},
+        {"reports": {"gps_is_silent": True}},
         {"shown_ago_s": 60.1},
         {"off_m": (1.0, 0.0)},
     ],

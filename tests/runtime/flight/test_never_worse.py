@@ -56,6 +56,13 @@ def test_good_receiver_is_not_replaced_if_its_reports_are_rare_or_stop(interval_
         assert flight.fly(1).navigator.output is Output.RESERVE
 
 
+def test_px4_gets_no_positions_while_the_reports_of_a_good_receiver_have_stopped():
+    flight = ClosedLoop("px4-copter", **SENSOR).fly(SETTLED_S)
+    flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, -1)
+    silent_s = flight.now_s
+    assert not flight.fly(10).positions_sent(silent_s)
+
+
 @pytest.mark.parametrize(
     ("vehicle", "parameters"), [("arducopter", GPS_INPUT), ("px4-copter", SENSOR), ("px4-copter", VISION)]
 )
