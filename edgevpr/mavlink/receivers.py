@@ -78,7 +78,7 @@ class Receivers:
         name = GPS_REPORTS[0]
         tracked = self._tracked.get(name) if name != own else None
         is_repeated = tracked is not None and tracked.report.age_at_report_s > MAX_FIX_AGE_S
-        return tracked is not None and not is_repeated and now_s - self.received_s > GPS_TIMEOUT_S
+        return tracked is not None and not is_repeated and now_s - tracked.report.t_s > GPS_TIMEOUT_S
 
 
 def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float] | None = None) -> tuple[float, float]:

@@ -73,9 +73,9 @@ def test_receiver_without_a_new_fix_is_gone():
 
 def test_receiver_whose_reports_stop_is_silent_unless_it_repeated_an_old_fix():
     fresh = receive((BEGIN_S, {}), (BEGIN_S + 0.6, {"stamp_s": BEGIN_S}))
-    assert not fresh.is_silent(BEGIN_S + 3.0)
-    assert fresh.is_silent(BEGIN_S + 3.2)
-    assert not fresh.is_silent(BEGIN_S + 3.2, own="GPS_RAW_INT")
+    assert not fresh.is_silent(BEGIN_S + 2.5)
+    assert fresh.is_silent(BEGIN_S + 2.6)
+    assert not fresh.is_silent(BEGIN_S + 2.6, own="GPS_RAW_INT")
     lost = receive((BEGIN_S, {}), (BEGIN_S + 0.8, {"stamp_s": BEGIN_S}))
     assert lost.choose_best(BEGIN_S + 1.0).age_at_report_s == pytest.approx(0.8)
     assert not lost.is_silent(BEGIN_S + 60.0)
