@@ -92,13 +92,15 @@ def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
 
 
 def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, GeoTag]:
-    tags = {}
+    tags: dict[str, GeoTag] = {}
     for row in rows:
         cells = {part: row[column].strip() for part, column in columns.items() if column < len(row)}
         try:
-            tags[PureWindowsPath(cells["file"]).name] = _parse_row(cells)
+            name, tag = PureWindowsPath(cells["file"]).name, _parse_row(cells)
         except (KeyError, ValueError) as error:
             raise UsageError(f"{path}: `{' '.join(row):.80}` is invalid ({error}): correct this line.") from error
+        if tags.setdefault(name, tag) != tag:
+            raise UsageError(f"{path} has two different rows for `{name}`: keep the one of the image in this folder.")
     if tags and not any(tag.position for tag in tags.values()):
         raise UsageError(f"{path} has no valid position: are latitude and longitude swapped, or not in degrees?")
     return tags

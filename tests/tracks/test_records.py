@@ -1,6 +1,7 @@
 """Reading what recordings say: each format, whole and damaged, and what a reader makes of it."""
 
 import struct
+from contextlib import nullcontext
 
 import pytest
 from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ulog
@@ -140,6 +141,15 @@ def test_read_record_reads_tables_of_other_programs(tmp_path, text, expected):
     at = record.tags_by_name["a.JPG"].position
     assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
     assert "separated by" in record.kind
+
+
+@pytest.mark.parametrize(("lat_deg", "is_accepted"), [(50.25, True), (50.26, False)])
+def test_read_record_refuses_two_positions_for_a_name(tmp_path, lat_deg, is_accepted):
+    (tmp_path / "table.csv").write_text(
+        f"SourceFile,GPSLatitude,GPSLongitude\nf/a.JPG,50.25,8.5\ng/a.JPG,{lat_deg},8.5\n"
+    )
+    with nullcontext() if is_accepted else pytest.raises(UsageError, match=r"two different rows for `a\.JPG`"):
+        assert read_record(tmp_path / "table.csv").tags_by_name.keys() == {"a.JPG"}
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def read_truth(path: str | Path) -> GroundTruth:
         if name in truth:
             raise UsageError(f"{where}: query `{name}` already has a row: keep one row with all its ref_files.")
         correct, loose = (frozenset(row.get(key, "").split()) for key in ("ref_files", "ref_files_loose"))
-        status = row.get("status", "ok")
+        status = row.get("status", "").casefold() or "ok"
         if correct and status == "novel":
             raise UsageError(f"{where}: query `{name}` is `novel` but has ref_files: remove them, or write `ok`.")
         truth[name] = (correct, loose - correct) if status in _SCORED_STATUSES else None

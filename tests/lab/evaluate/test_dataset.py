@@ -38,7 +38,7 @@ def test_load_dataset_reads_right_and_ignored_references_of_scored_queries(folde
     assert dataset.unscored == 1
 
 
-@pytest.mark.parametrize("row", ["b.png,,,ok", "b.png,,,novel"])
+@pytest.mark.parametrize("row", ["b.png,,,ok", "b.png,,,NOVEL", "b.png,,, "])
 def test_load_dataset_reads_a_query_off_the_map(folder, row):
     dataset = load(folder, f"query_file,ref_files,ref_files_loose,status\n{row}\na.png,a.png,,ok\n")
     assert list_correct(dataset) == {"b.png": (set(), set()), "a.png": ({"a.png"}, set())}
