@@ -1,9 +1,9 @@
 """MAVSDK beside edgevpr on one flight controller: python mavsdk_beside.py [PORT]
 
 A router that owns the flight controller's port sends a copy of everything to this UDP port (docs/how-to/
-run-with-other-software.md). Both are heard there: the autopilot, and edgevpr, which is component 197 of the same vehicle.
-Says once a second where the autopilot believes to be, and whether edgevpr knows the place. Ends when edgevpr has been
-silent for five seconds. MAVSDK is `pip install "mavsdk>=4"`.
+run-with-other-software.md). Both are heard there: the autopilot, and edgevpr, which is component 197 of the same
+vehicle. Says once a second where the autopilot believes to be, and whether edgevpr knows the place. Ends when edgevpr
+has been silent for five seconds. MAVSDK is `pip install "mavsdk>=4"`.
 """
 
 import json
