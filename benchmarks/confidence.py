@@ -1,6 +1,6 @@
 """Judge the confidence of matches, leaving one site out, on every set: `python benchmarks/confidence.py`.
 
-The script first gathers the evidence of every query in the map of every set (see `confidence_rows`; an hour on two
+The script first gathers the evidence of every query in the map of every set (see `confidence_rows`; two hours on two
 cores, kept in --work). For each set, it then fits the shipped model anew to all other sites, without any query of the
 set's site, adapts it to the map of the set as `map build` does, and judges it by the queries of the set and of all
 other sites. The kinds of evidence, and how far a map may change the weights, were chosen on all sets.
@@ -28,7 +28,7 @@ from shipped_model import SiteEvidence, fit_shipped_model
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, QueryResult, adapt_model
-from edgevpr.runtime.recognise.calibration import MIN_PLACES
+from edgevpr.runtime.recognise.calibration import MIN_PLACES, read_calibration_for
 from edgevpr.runtime.recognise.confidence import Model
 from edgevpr.runtime.recognise.evidence import AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE, Evidence
 from edgevpr.runtime.recognise.judge import ConfidenceRule, make_accept_rule
@@ -174,8 +174,8 @@ def replay_routes(name: str, models: dict[str, Models]) -> base.Row:
         "leave": own_paths[:middle] + foreign_paths + own_paths[middle:],
     }
     result: base.Row = {"set": name, "ways": {}}
-    with walks.make_map(DATA / name) as (place_map, index, technique):
-        rule = make_accept_rule(technique, walks.make_config().match)
+    with walks.make_map(DATA / name, images=DATA / name / "ref") as (place_map, index, technique):
+        rule = make_accept_rule(technique, walks.make_config().match, 1, read_calibration_for(place_map))
         rule = replace(rule, confidence_rule=ConfidenceRule(models[name], walks.make_config().match.accept_precision))
         for order, paths in orders.items():
             counts = {}
