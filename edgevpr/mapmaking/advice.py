@@ -50,6 +50,7 @@ _MIN_CLEAR_PAIRS = 3  # pairs with rotation or vertical motion
 _MIN_CLEAR_FRACTION = 0.2  # and their fraction of all pairs that show the same ground
 _MIN_PAIRS = 6  # the same, including pairs with sideways motion
 _MIN_FRACTION = 0.75
+_MAX_FOV_RATIO = 1.1  # of one lens: crops of another shape differ by 4 %
 _MAX_DOWN_DEG = 25.0  # tilt of a gimbal from straight down
 _MIN_FORWARD_DEG = 45.0
 _MAX_USEFUL_HZ = 4.0  # places per second of a video; more of them look nearly the same
@@ -119,6 +120,19 @@ def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -
             f"The camera looks straight down ({why}): pass --camera nadir, or --camera forward if it faces forward."
         )
     _log.info("assuming that the camera faces forward (%s): pass --camera nadir if it looks straight down", why)
+
+
+@show_elapsed("comparing fields of view")
+def require_one_lens(pictures: FlightPictures) -> None:
+    """Raise UsageError if the EXIF data of pictures that are to be levelled show different fields of view: with the one
+    configured, the others would get a wrong scale."""
+    paths = list_images(pictures.folder) if pictures.folder else []
+    fovs_deg = [fov_deg for fov_deg in map(read_fov_deg, paths) if fov_deg is not None]
+    if fovs_deg and max(fovs_deg) > _MAX_FOV_RATIO * min(fovs_deg):
+        raise UsageError(
+            f"The images have fields of view from {min(fovs_deg):.0f} to {max(fovs_deg):.0f} degrees (EXIF data), but "
+            "are levelled with one: keep those of one camera, without zoom, in a folder of their own."
+        )
 
 
 @show_elapsed("measuring the tilt of the camera")

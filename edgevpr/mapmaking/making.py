@@ -140,7 +140,8 @@ def _open_flight(
     plan: MapPlan, pictures: FlightPictures, config: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures and create the technique. Raises UsageError if the camera looks straight down but `--camera` is
-    missing, or if a camera that should look straight down is tilted and its angles are not recorded."""
+    missing, if a camera that should look straight down is tilted and its angles are not recorded, or if pictures of
+    several lenses are to be levelled with one."""
     source, settings, camera = pictures.open(), plan.parameters, config.camera
     name = _choose_name(plan, place_map)
     if camera is None and place_map is None and "camera" not in settings and make_camera_setting(name, "nadir"):
@@ -148,6 +149,8 @@ def _open_flight(
     if camera:  # a technique without this setting rejects it
         settings = settings | {"camera": camera}
     technique = _make_technique(plan, place_map, name, settings)
+    if technique.spec.looks_down and (config.fov_deg or config.lens):
+        advice.require_one_lens(pictures)
     if technique.spec.looks_down and not config.gimbal and read_mount(config) == STRAIGHT_DOWN:
         advice.require_level_camera(pictures, config.fov_deg)
     return source, technique

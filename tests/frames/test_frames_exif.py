@@ -1,12 +1,17 @@
 """Positions, headings and times from EXIF; the tags are numbered as in the EXIF standard (JEITA CP-3451)."""
 
+from contextlib import nullcontext
+
 import photographs
 import pytest
 
+from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif, read_fov_deg
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
+from edgevpr.mapmaking.advice import require_one_lens
+from edgevpr.mapmaking.pictures import FlightPictures
 
 pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
 
@@ -109,3 +114,11 @@ def test_fov_deg_of_is_that_of_the_equivalent_focal_length(focal_mm, sides, fov_
     size = dict(zip((0xA002, 0xA003), sides, strict=False))
     photographs.write_jpeg(tmp_path / "photo.jpg", camera={0xA405: focal_mm, **size})
     assert read_fov_deg(tmp_path / "photo.jpg") == (None if fov_deg is None else pytest.approx(fov_deg, abs=0.1))
+
+
+@pytest.mark.parametrize(("focal_mm", "is_accepted"), [(24, True), (48, False)])
+def test_require_one_lens_refuses_wide_and_tele_pictures_in_one_folder(focal_mm, is_accepted, tmp_path):
+    for name, focal in (("a.jpg", 24), ("b.jpg", focal_mm)):
+        photographs.write_jpeg(tmp_path / name, camera={0xA405: focal, 0xA002: 4000, 0xA003: 3000})
+    with nullcontext() if is_accepted else pytest.raises(UsageError, match="from 40 to 72 degrees"):
+        require_one_lens(FlightPictures(source=str(tmp_path)))
