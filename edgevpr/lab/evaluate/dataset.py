@@ -10,6 +10,7 @@ published data sets by their files:
 
 import csv
 import io
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
+_log = logging.getLogger(__name__)
+
 _SCORED_STATUSES = ("ok", "novel")  # statuses of a scored query; novel: its place is not in the map
 # Maps the file name of each query, in file order, to the file names of its correct references (none: the query is off
 # the map) and of the ignored ones, where a match counts as neither correct nor wrong. None: the query is not scored.
@@ -167,12 +170,16 @@ def _match_near(
 ) -> Dataset:
     """Make a data set in which the references within `within_m` metres of a query are correct. `queries_m` and
     `references_m` are their positions, metres east and north of a common origin. Raises UsageError if no query has a
-    correct reference."""
+    correct reference. References without a position are ignored: a match with one may be right."""
     names, truth = [decode_name(path.name) for path in references_m], GroundTruth()
+    unplaced = frozenset(list_names(ref_dir)) - set(names)
+    if unplaced:
+        text = "%d of %d references have no position: a match with one of them counts as neither right nor wrong"
+        _log.warning(text, len(unplaced), len(unplaced) + len(names))
     points_m = np.array(list(references_m.values()))
     for path, query_m in queries_m.items():
         near = np.flatnonzero(np.hypot(*(points_m - query_m).T) <= within_m)
-        truth[decode_name(path.name)] = frozenset(names[index] for index in near), frozenset()
+        truth[decode_name(path.name)] = frozenset(names[index] for index in near), unplaced
     if not any(answers and answers[0] for answers in truth.values()):
         raise UsageError(f"No query was taken within {within_m:g} m of a reference: pass a larger --within-m.")
     return make_dataset(query_dir, ref_dir, truth, query_dir)

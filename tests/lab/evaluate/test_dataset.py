@@ -105,7 +105,7 @@ def test_open_folder_reads_utm_coordinates_from_names(tmp_path, inside):
         open_folder(tmp_path, 25)
 
 
-def test_open_folder_matches_positions_by_distance(tmp_path):
+def test_open_folder_matches_positions_by_distance(tmp_path, caplog):
     here = 47.0, 8.0
     queries = {"q.jpg": (0, 0), "far.jpg": (600, 0)}
     places = {"near.jpg": (3, 0), "beside.jpg": (20, 0), "far.jpg": (60, 0)}
@@ -115,10 +115,11 @@ def test_open_folder_matches_positions_by_distance(tmp_path):
             f"{name},{','.join(map(repr, offset_position(*here, *offset_m)))}" for name, offset_m in offsets.items()
         ]
         (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
-    dataset = open_folder(tmp_path, 25)
-    assert list_correct(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, set()), "far.jpg": (set(), set())}
+    dataset, unplaced = open_folder(tmp_path, 25), {"nowhere.jpg"}
+    assert list_correct(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, unplaced), "far.jpg": (set(), unplaced)}
+    assert "1 of 4 references have no position" in caplog.text
     assert dataset.unscored == 1
-    assert list_correct(open_folder(tmp_path, 4))["q.jpg"] == ({"near.jpg"}, set())
+    assert list_correct(open_folder(tmp_path, 4))["q.jpg"] == ({"near.jpg"}, unplaced)
     with pytest.raises(UsageError, match="--within-m"):
         open_folder(tmp_path, 0.1)
     (tmp_path / "ref" / "positions.csv").unlink()
