@@ -24,9 +24,7 @@ def compute_counts(parts: Mapping[str, float]) -> dict[str, Any]:
         full = technique.spec.max_matches * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
         landmarks = 0.0
         if camera == "nadir":  # of the frame; matched with those of the best place and of the last frame
-            landmarks = (
-                parts["flight: landmarks of a frame"] + 2 * parts["flight: visual odometry since the previous frame"]
-            )
+            landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: odometry since the last frame"]
         work = {
             "encode": encode,
             "match_per_place": (parts[f"{name}: a query"] - encode - large - full) / technique.candidates,

@@ -83,7 +83,7 @@ def list_landmark_parts(picture: Image) -> Iterator[tuple[str, Callable[[], obje
         return step
 
     yield "flight: landmarks of a frame", lambda: detect_landmarks(moved, None, QUERY_LANDMARKS)
-    yield "flight: visual odometry since the previous frame", measure_step
+    yield "flight: odometry since the last frame", measure_step
 
 
 def run_parts(*maps: str) -> None:

@@ -125,7 +125,7 @@ def test_compute_counted_costs_scales_instructions_but_not_memory():
     parts, rate_hz = read_instructions(), 1e6 * PI.benchmark_score.arm64_mips
     assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
     query_s = there.encode.wall_s + replace(there, candidates=30).match(10_000).wall_s
-    landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: visual odometry since the previous frame"]
+    landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: odometry since the last frame"]
     assert query_s == pytest.approx((parts["down: a query"] + landmarks) / rate_hz, rel=1e-3)
     assert (there.ram_bytes_per_place, there.process_mb) == (1_000, 90.0)
 
