@@ -26,13 +26,13 @@ from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
-_log = logging.getLogger(__name__)
-
 _SCORED_STATUSES = ("ok", "novel")  # statuses of a scored query; novel: its place is not in the map
 # Maps the file name of each query, in file order, to the file names of its correct references (none: the query is off
 # the map) and of the ignored ones, where a match counts as neither correct nor wrong. None: the query is not scored.
 GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
 PointsByPath = dict[Path, tuple[float, float]]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
