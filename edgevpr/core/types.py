@@ -71,8 +71,8 @@ class Vehicle:
     north). `sink_m_s`: velocity down. `innovation_ratio`: innovation of measured positions over the filter's gate;
     above 1 the filter refuses them. `has_position`: the filter has a position. `gps`: newest receiver position, near
     the estimate or not (None: none is recent). `gps_is_silent`: reports of a receiver with a fix have stopped, so it is
-    unknown whether it still has one. `t_fix_s`: time of the newest fix from edgevpr that may already affect
-    the position (-inf: none does)."""
+    unknown whether it still has one. `reaches_another`: another vehicle's autopilot would use our positions as well.
+    `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
 
     lat_deg: float
     lon_deg: float
@@ -92,6 +92,7 @@ class Vehicle:
     innovation_ratio: float | None = None
     gps: Receiver | None = None
     gps_is_silent: bool = False
+    reaches_another: bool = False
     t_fix_s: float = -math.inf
 
     def is_fresh(self, t_mono_s: float) -> bool:

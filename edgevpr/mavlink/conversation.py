@@ -73,7 +73,7 @@ class Conversation:
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
         self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
-        self._shares_link = False  # last announced state
+        self._is_gps_silent = False  # last announced state
 
     @property
     def channel(self) -> Channel:
@@ -180,12 +180,11 @@ class Conversation:
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
         if is_alive or self._was_alive is not None:
             self._was_alive = is_alive
-        shares_link = self.channel.is_untargeted and self.autopilot.identity.shares_link(now_s)
-        if shares_link != self._shares_link:
-            self._shares_link = shares_link
-            severity = Severity.WARNING if shares_link else Severity.INFO
-            text = "two autopilots on link: nothing sent" if shares_link else "one autopilot on link again"
-            self.announce(severity, text, "link")
+        is_gps_silent = self.autopilot.vehicle is not None and self.autopilot.vehicle.gps_is_silent
+        if is_gps_silent != self._is_gps_silent:
+            self._is_gps_silent = is_gps_silent
+            text = "GPS reports stopped: requested again" if is_gps_silent else "GPS reports arrive again"
+            self.announce(Severity.WARNING if is_gps_silent else Severity.INFO, text, "GPS reports")
         self.fixes.report_silence(self.autopilot.assess_readiness(now_s).silence_reason, now_s)
         while self._reports:
             self.announce(*self._reports.pop(0))
@@ -251,10 +250,10 @@ class Conversation:
         state = self.settings.listener.estimate_state(t_s := now_s - choice.lag_s)
         if self.requests.is_paused:
             state = None
+        if autopilot.reaches_another(now_s):  # not even "no fix", which would spoil the receiver of the other vehicle
+            return None
         if choice.channel is Channel.SENSOR:
             return autopilot.px4.make_state_message(state, None, system_id, now_s)
-        if autopilot.identity.shares_link(now_s):
-            return None
         if choice.channel is Channel.VISION:
             return autopilot.origin and autopilot.px4.make_state_message(state, autopilot.origin, system_id, now_s)
         if (stamp_s := autopilot.stamp_s(t_s)) is None:
@@ -308,8 +307,6 @@ class Conversation:
             self.send(*messages.make_report_requests(system_id, self.autopilot.firmware, is_continuous))
         elif now_s - self.autopilot.receivers.received_s > REQUEST_INTERVAL_S:
             self.send(*messages.make_gps_requests(system_id))
-            if vehicle and vehicle.gps_is_silent:
-                self.announce(Severity.WARNING, "GPS reports stopped: requested again", "GPS reports")
 
     def _reset(self, why: ReasonCode) -> None:
         """Start over with an autopilot that has lost its state. `why`: reason reported for the awaited fixes."""

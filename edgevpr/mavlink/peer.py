@@ -84,9 +84,9 @@ class Identity:
                 log.warning("the autopilot is now %s: %s has been silent for %.0f s", endpoint, self.current, silent_s)
                 self.has_moved = True
             self.current, self._has_warned = endpoint, False
-        if is_heartbeat and self.current and endpoint.address == self.current.address and endpoint != self.current:
-            self._other_s = now_s
         if endpoint != self.current:
+            if is_heartbeat and self.current and endpoint.address == self.current.address:
+                self._other_s = now_s
             # Do not count while any sender may still become our autopilot.
             self.foreign_messages += self.current is not None or self._configured is not None
             return False
@@ -186,6 +186,10 @@ class Autopilot:
     def stamp_s(self, t_mono_s: float) -> float | None:
         """Return `t_mono_s` as a timestamp for the autopilot; None if its clock is unknown. PX4 converts it itself."""
         return t_mono_s if self.firmware == mavlink.MAV_AUTOPILOT_PX4 else self.clock.stamp_s(t_mono_s)
+
+    def reaches_another(self, now_s: float) -> bool:
+        """Return True if another vehicle's autopilot would use the positions that we send as well."""
+        return self.selector.choice.channel.is_untargeted and self.identity.shares_link(now_s)
 
     def is_alive(self, now_s: float) -> bool:
         """Return True if a heartbeat of the autopilot arrived through the current port in the last five seconds."""
@@ -329,6 +333,7 @@ class Autopilot:
             t_received_s=now_s,
             has_gps=has_gps,
             gps=gps,
+            reaches_another=self.reaches_another(now_s),
             gps_is_silent=self.receivers.is_silent(now_s, self._own_report),
             height_m=self.heights.compute_height_m(now_s),
             height_doubt_m=self.heights.doubt_m,

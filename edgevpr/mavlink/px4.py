@@ -53,9 +53,9 @@ class Px4Fusion:
         if state is None:
             return None
         self._sent_s, self._is_vision = now_s, origin is not None
-        return (
-            messages.make_vision_position(state, origin) if origin else messages.make_position_sensor(state, system_id)
-        )
+        if origin:
+            return messages.make_vision_position(state, origin)
+        return messages.make_position_sensor(state, system_id)
 
     def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_trusted: bool = True) -> None:
         """Process an ESTIMATOR_STATUS. `receiver`: the best GPS receiver with a fix (None: none has a fix).

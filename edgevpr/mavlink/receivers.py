@@ -56,7 +56,7 @@ class Receivers:
             report = replace(previous.report, age_at_report_s=now_s - previous.report.t_s)
             self._tracked[name] = replace(previous, report=report)
             return
-        report = _to_receiver(message, t_s)
+        report = replace(_to_receiver(message, t_s), age_at_report_s=now_s - t_s)
         is_plausible = report.sd_m <= MAX_PLAUSIBLE_SD_M
         is_steady = previous is not None and is_plausible and _is_continuous(previous.report, report)
         since_s = previous.steady_since_s if previous and is_steady else t_s

@@ -270,7 +270,8 @@ class SourceSets:
         self._with_gps, self._without = settings.gps, settings.no_gps
         self._requested: int | None = None
         self._requested_s = math.inf
-        self._bad_s = self._needless_s = -math.inf  # when GPS was last not good, and when another set was last better
+        self._bad_s = -math.inf  # when GPS was last not good
+        self._alternative_s = -math.inf  # when there was last something other than a receiver that the map contradicts
 
     @property
     def are_set(self) -> bool:
@@ -286,9 +287,9 @@ class SourceSets:
         if not has_gps:
             self._bad_s = now_s
         if has_own or not has_receiver:
-            self._needless_s = now_s
+            self._alternative_s = now_s
         number = self._without if not has_gps and has_own else None
-        if self._requested is not None and now_s - min(self._bad_s, self._needless_s) > _MIN_GPS_GOOD_S:
+        if self._requested is not None and now_s - min(self._bad_s, self._alternative_s) > _MIN_GPS_GOOD_S:
             number = self._with_gps
         is_alive = answered_s >= self._requested_s or now_s - self._requested_s < _SOURCE_SET_RETRY_S
         if number is None or (number == self._requested and is_alive):

@@ -94,7 +94,7 @@ class Navigator(Listener):
         self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
-        self._height_ratio, self._height_ratio_sd, self._settled_doubt_m = 1.0, 0.0, 0.0
+        self._height_ratio, self._height_ratio_sd, self._resolved_doubt_m = 1.0, 0.0, 0.0
         self._shared_sd_m = map_sd_m  # standard deviation of the error common to the last fixes
 
     @property
@@ -117,12 +117,12 @@ class Navigator(Listener):
     def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
         """Set the ratio of visual height to the autopilot's height above ground (1.0: about equal). Odometry is scaled
         by it. `ratio_sd` is its relative error. Where pictures miss a step, the ground may have changed back unnoticed:
-        then the claimed error contains the deviation from 1.0, if that is larger. Pictures settle what the sources of
-        the autopilot's height have contradicted each other by so far."""
+        then the claimed error contains the deviation from 1.0, if that is larger. Pictures also
+        resolve the contradictions between the sources of the autopilot's height so far."""
         if ratio != 1.0:
             self._navigation.restart_odometry_scale(ratio - 1.0, _SCALE_TOLERANCE)
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
-        self._settled_doubt_m = self._vehicle.height_doubt_m if self._vehicle else 0.0
+        self._resolved_doubt_m = self._vehicle.height_doubt_m if self._vehicle else 0.0
 
     def handle_channel(self, channel: Channel) -> None:
         """Set the channel through which positions are sent. With a continuous one, the autopilot's velocity comes from
@@ -196,7 +196,7 @@ class Navigator(Listener):
             self._navigation.restart_odometry_scale(error, _MATCH_SCALE_TOLERANCE)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
-            if self._navigation.path_velocity_m_s is not None:  # the frame is older than the path, so it proves nothing
+            if self._navigation.path_velocity_m_s is not None:  # the frame is older than the path: nothing to compare
                 return _withhold(ReasonCode.CONTINUOUS if self._channel.is_continuous else ReasonCode.NO_TELEMETRY)
             self._navigation.start_at_fix(match)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
@@ -219,7 +219,7 @@ class Navigator(Listener):
             return None
         if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh(now_s):
             return None
-        if is_gps_aided(vehicle) or vehicle.gps_is_silent or self._estimate(now_s) is None:
+        if _may_use_gps(vehicle) or self._estimate(now_s) is None:
             return None
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s).fix
 
@@ -265,7 +265,9 @@ class Navigator(Listener):
         """Decide what to send now."""
         if vehicle is None:
             return Output.STARTING
-        uses_gps = is_gps_aided(vehicle) or vehicle.gps_is_silent
+        if vehicle.reaches_another:
+            return Output.LINK_SHARED
+        uses_gps = _may_use_gps(vehicle)
         if uses_gps and not self._channel.works_with_gps:
             return Output.GPS_IN_USE
         if estimate is None:
@@ -301,7 +303,7 @@ class Navigator(Listener):
         vehicle = event.vehicle or self._vehicle
         ratio, ratio_sd = self._height_ratio, self._height_ratio_sd
         if vehicle and vehicle.height_m and vehicle.height_m > 0:
-            doubt_m = max(0.0, vehicle.height_doubt_m - self._settled_doubt_m)
+            doubt_m = max(0.0, vehicle.height_doubt_m - self._resolved_doubt_m)
             ratio_sd = math.hypot(ratio_sd, doubt_m / vehicle.height_m)
         return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_ratio_sd=ratio_sd)
 
@@ -324,9 +326,7 @@ class Navigator(Listener):
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.CONTINUOUS)
-        if (
-            is_gps_aided(vehicle) or vehicle.gps_is_silent
-        ):  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
+        if _may_use_gps(vehicle):  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
             return _withhold(ReasonCode.HAS_GPS if self._trusts_gps else ReasonCode.HAS_WRONG_GPS)
         if self._distrusts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)
@@ -360,6 +360,11 @@ class Navigator(Listener):
     def _compute_claimed_m(self, estimate: NavState) -> float:
         """Return the accuracy to claim for an estimate: never better than the error common to all fixes."""
         return max(self._shared_sd_m, estimate.accuracy_m)
+
+
+def _may_use_gps(vehicle: Vehicle) -> bool:
+    """Return True unless the autopilot's reports show that it has lost GPS."""
+    return is_gps_aided(vehicle) or vehicle.gps_is_silent
 
 
 def _choose_drift(channel: Channel) -> Drift:

@@ -33,6 +33,7 @@ class Output(Enum):
     CONTRADICTS_GPS = Severity.WARNING, "position contradicts GPS: nothing sent"
     LEADS_AWAY = Severity.WARNING, "autopilot drifts off GPS: nothing sent"
     REFUSED = Severity.WARNING, "autopilot refuses positions: not sent"
+    LINK_SHARED = Severity.WARNING, "two autopilots on link: nothing sent"
 
     @property
     def is_sent(self) -> bool:

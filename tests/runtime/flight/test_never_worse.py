@@ -61,6 +61,8 @@ def test_px4_gets_no_positions_while_the_reports_of_a_good_receiver_have_stopped
     flight.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, -1)
     silent_s = flight.now_s
     assert not flight.fly(10).positions_sent(silent_s)
+    texts = [message.text for _, message in flight.sent if message.get_type() == "STATUSTEXT"]
+    assert texts[-2:] == ["edgevpr: GPS reports stopped: requested again", "edgevpr: GPS reports arrive again"]
 
 
 @pytest.mark.parametrize(
@@ -77,8 +79,8 @@ def test_positions_without_an_address_are_not_sent_beside_another_autopilot(vehi
     ]
     assert bool(flight.positions_sent(heard_s)) is (parameters is SENSOR) is bool(targets)
     assert set(targets) <= {1}
-    texts = [message.text for t_s, message in flight.sent if message.get_type() == "STATUSTEXT"]
-    assert ("edgevpr: two autopilots on link: nothing sent" in texts) is (parameters is not SENSOR)
+    assert (flight.navigator.output is Output.LINK_SHARED) is (parameters is not SENSOR)
+    assert Output.LINK_SHARED.text == "two autopilots on link: nothing sent"
     assert flight.fly(2).positions_sent(flight.now_s - 1)
 
 
