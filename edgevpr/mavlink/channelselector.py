@@ -42,8 +42,9 @@ class ChannelSelector:
     change the channel is chosen again. Old firmware does not answer requests for a parameter that it lacks. Such a
     parameter counts as absent after four rounds with answers for others, or more on a link that loses messages.
 
-    `choice`: the channel. Before the first requests it is command 43003, for programs that only send fixes and
-    need no reports. Then it is `Channel.NONE` until all parameters that determine it are known."""
+    `version`: (major, minor) of the firmware (None: unknown). `choice`: the channel. Before the first requests it is
+    command 43003, for programs that only send fixes and need no reports. Then it is `Channel.NONE` until all parameters
+    that determine it are known."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
@@ -51,7 +52,7 @@ class ChannelSelector:
         self._decision = Decision(_DEFAULT_CHOICE)
         self._reported: Decision | None = None
         self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), VehicleKind.OTHER
-        self._version: tuple[int, int] | None = None
+        self.version: tuple[int, int] | None = None
         self._version_requests = 0
         self._absent: set[str] = set()
         self._requests: Counter[str] = Counter()
@@ -77,7 +78,7 @@ class ChannelSelector:
                 if previous != (self._autopilot, self._kind):
                     self._decide()
             case "AUTOPILOT_VERSION":
-                self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
+                self.version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
             case "PARAM_VALUE" if message.param_id in self._table.all_names:
                 value = read_parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
@@ -102,7 +103,7 @@ class ChannelSelector:
         missing = self._find_missing()
         names = missing[: MAX_PARALLEL_REQUESTS - 1]
         names += self._choose_refresh(is_only_request=not missing)
-        wants_version = self._version is None and self._version_requests < MAX_VERSION_REQUESTS
+        wants_version = self.version is None and self._version_requests < MAX_VERSION_REQUESTS
         self._is_incomplete = bool(missing) or wants_version
         self._pending, self._requested_s = set(names), now_s
         self._requests.update(names)
@@ -187,7 +188,7 @@ class ChannelSelector:
             self._reported = decision
 
     def _report(self, decision: Decision) -> None:
-        version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
+        version = f" {self.version[0]}.{self.version[1]}" if self.version else ""
         vehicle, choice = f"{self._table.name}{version} on a {self._kind.value}", decision.choice
         faults = list(decision.faults)
         if choice.channel is Channel.NONE:

@@ -291,7 +291,14 @@ class Autopilot:
                 if not self.accuracy.has_position:
                     self._listener.handle_no_position(now_s)
                 if name == "ESTIMATOR_STATUS":
-                    self.px4.handle(message, now_s, self._choose_receiver(now_s), self._listener.trusts_gps())
+                    self.px4.handle(
+                        message,
+                        now_s,
+                        self._choose_receiver(now_s),
+                        is_trusted=self._listener.trusts_gps(),
+                        version=self.selector.version,
+                        is_flying=bool(self.is_armed),
+                    )
             case "GLOBAL_POSITION_INT":
                 self._handle_position(message, now_s)
             case "ATTITUDE":

@@ -221,6 +221,14 @@ def test_px4_uses_gps_again_after_a_receiver_was_flagged_as_spoofed(matches, par
     assert not flight.positions_sent(SETTLED_S + 20 + GPS_AGAIN_S)
 
 
+@px4_channels
+def test_restart_sends_to_a_px4_that_does_not_use_its_receiver(parameters):
+    flight = ClosedLoop("px4-copter", velocity_m_s=5j, **parameters).fly(SETTLED_S)
+    flight.set("SIM_GPS_SPOOF", 1).fly(20)
+    assert flight.start().fly(20).positions_sent(flight.now_s - 10)
+    assert flight.fly(20).worst_m(flight.now_s - 20)[1] < 8
+
+
 @pytest.mark.parametrize(
     ("vehicle", "parameters"),
     [
