@@ -1,5 +1,5 @@
 """A closed loop without sockets, threads and real time: a simulated autopilot whose vehicle obeys its estimate, and the
-conversation and the navigator of edgevpr beside it, in steps of 20 ms. The same flight without edgevpr is its control.
+conversation and the navigator of edgevpr beside it, in steps of 40 ms. The same flight without edgevpr is its control.
 """
 
 import cmath

@@ -12,7 +12,7 @@ from simulated.motion import Motion
 from simulated.px4_rules import Px4
 from simulated.reports import FILTER_REPORTS, REPORTS, Report
 
-STEP_S = 0.02
+STEP_S = 0.04
 VEHICLES: dict[str, Callable[[Motion], Firmware]] = {
     "arducopter": lambda motion: ArduPilot("copter", motion),
     "arduplane": lambda motion: ArduPilot("plane", motion),
