@@ -39,6 +39,11 @@ class Pose:
     is_surveyed: bool = False
     recorded: Position | None = None
 
+    @property
+    def is_confirmed(self) -> bool:
+        """True if direction and size are not only recorded, but those of an orthophoto or found by refinement."""
+        return self.is_surveyed or self.recorded is not None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Receiver:

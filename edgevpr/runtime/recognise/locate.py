@@ -25,7 +25,10 @@ from edgevpr.runtime.recognise.relief import UNKNOWN_HEIGHT_SD, compute_nadir_sd
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
 _VOTE_SD = 0.016
 _LANDMARK_SD = 0.008
-_POSE_SD = 0.03  # due to scale and rotation of a place's pose, as a fraction of the length of a shift
+# Due to scale and rotation of a place's pose, as a fraction of the length of a shift. If no other picture has confirmed
+# them, both are as recorded: barometers over sloping ground, and compasses or courses in wind, err by a fifth.
+_POSE_SD = 0.03
+_RECORDED_POSE_SD = 0.2
 _MEAN_VARIANCE_RATIO = 0.25  # variance of the mean of the votes, relative to that of a single vote
 _MIN_SCORE_RATIO = 0.5  # matches with at least this fraction of the best score are also used
 _MAX_DIFFERENCE_SD = 4.0  # places whose positions differ by more are not used
@@ -70,14 +73,16 @@ class Located:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlaceEstimate:
     """Position of the aircraft computed from one place. `position_m` (2,) is metres east and north of the best place.
-    Its covariances (2, 2) are `match_covariance`, of the match, and `pose_covariance`, of the pose. `rotation_deg`
-    and `height_ratio`, of the query on the place, are as in `FineMatch`."""
+    Its covariances (2, 2) are `match_covariance`, of the match, and `pose_covariance`, of the pose. `recorded_m2`:
+    variance along each axis due to direction and size of a pose that are only recorded; neighbours have the same error.
+    `rotation_deg` and `height_ratio`, of the query on the place, are as in `FineMatch`."""
 
     place_id: int
     score: float
     position_m: Doubles
     match_covariance: Doubles
     pose_covariance: Doubles
+    recorded_m2: float
     rotation_deg: float
     height_ratio: float | None
 
@@ -186,7 +191,8 @@ def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:
         chi2 = sum(error_m @ np.linalg.solve(covariance, error_m) for error_m, covariance in errors_m)
         match_covariance = match_covariance * max(1.0, float(chi2) / (2 * (len(estimates) - 1)))
     # Neighbours have the same pose errors, so averaging does not reduce them.
-    return position_m, match_covariance + np.mean([place.pose_covariance for place in estimates], axis=0)
+    pose_covariances = [place.pose_covariance + place.recorded_m2 * np.eye(2) for place in estimates]
+    return position_m, match_covariance + np.mean(pose_covariances, axis=0)
 
 
 def _estimate_position(
@@ -219,14 +225,15 @@ def _estimate_position(
     dy = step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
     axes = picture_axes(pose.up_deg)
     step_m = pose.footprint_m * (axes @ (dx, -dy))
-    pose_error = (_POSE_SD * float(np.hypot(*step_m))) ** 2 * np.eye(2)
+    length_m = float(np.hypot(*step_m))
     covariance_up = covariance * [[1, -1], [-1, 1]]  # y up instead of down
     return _PlaceEstimate(
         place_id=place.place_id,
         score=match.score,
         position_m=place_offset_m + step_m,
-        match_covariance=pose.footprint_m**2 * (axes @ covariance_up @ axes.T) + pose_error,
+        match_covariance=pose.footprint_m**2 * (axes @ covariance_up @ axes.T) + (_POSE_SD * length_m) ** 2 * np.eye(2),
         pose_covariance=covariance_matrix(pose.covariance_m2),
+        recorded_m2=0.0 if pose.is_confirmed else (_RECORDED_POSE_SD * length_m) ** 2,
         rotation_deg=rotation_deg,
         height_ratio=height_ratio,
     )

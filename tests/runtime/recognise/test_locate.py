@@ -71,6 +71,13 @@ def test_locate_gives_the_position_of_the_aircraft_not_of_the_image_centre(turne
     assert measure_offset_m(found.position) == pytest.approx(there, abs=0.01)
 
 
+@pytest.mark.parametrize("pose", [{"is_surveyed": True}, {"recorded": ORIGIN}, {}], ids=["surveyed", "refined", "none"])
+def test_locate_claims_an_error_of_direction_and_size_that_are_only_recorded(pose):
+    found = [locate([make_candidate(shift=shift, **pose)], CELLS) for shift in ((0, 0), (12, 0))]
+    at_centre_m, beside_m = (located.accuracy_m for located in found)
+    assert beside_m == pytest.approx(math.hypot(at_centre_m, 0.03 * 24 if pose else 0.2 * 24), rel=0.05)
+
+
 def test_locate_scales_the_nadir_offset_with_the_height():
     proof = make_agreement(20, (0.0, 0.0), scale=2.0)
     found = locate([make_candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
