@@ -74,7 +74,8 @@ def run_match(args: Namespace) -> int:
     recogniser = open_recogniser(config, board, known=known_fields, tracks_flight=args.follow)
     matches = []
     unusable: list[ImageError] = []
-    source = open_source(args.source, positions=shared.to_path(args.positions), live=False)
+    positions, upright = shared.to_path(args.positions), not recogniser.technique.spec.looks_down
+    source = open_source(args.source, positions=positions, live=False, upright=upright)
     if known_fields:
         _require_known(args, known_fields, recogniser)
     frames = read_to_end(source, lambda error: shared.skip_image(error, unusable))

@@ -67,8 +67,9 @@ def make_sort_key(name: str) -> tuple[list[str | int], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
-def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
-    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated by its EXIF data, without alpha channel. A
+def read_image(path: str | Path, depth: DepthRange | None = None, *, upright: bool = True) -> Image:
+    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, without alpha channel. With `upright`, it is rotated
+    by its EXIF data; without, its top remains that of the camera, to which heading and tilt refer. A
     16-bit image is scaled to the range `depth` of the images before it (None: to its own). Raises ImageError unless the
     file is a complete image of 8 or 16 bits, with at least 16x16 and at most `MAX_PIXELS` pixels."""
     try:
@@ -77,17 +78,19 @@ def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): choose a readable file.") from error
     except MemoryError:
         raise ImageError(f"{path} does not fit in the free memory: use a smaller image.") from None
-    return decode_image(data, str(path), depth)
+    return decode_image(data, str(path), depth, upright=upright)
 
 
-def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Image:
+def decode_image(data: bytes, path: str, depth: DepthRange | None = None, *, upright: bool = True) -> Image:
     """Decode the content of an image file, as `read_image` does; `path` is its name in error messages."""
     if _is_incomplete(data):
         raise ImageError(f"{path} is empty, truncated or damaged: copy it again from the camera.")
-    image = None
+    image, flags = None, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+    if not upright:
+        flags |= cv2.IMREAD_IGNORE_ORIENTATION
     with contextlib.suppress(cv2.error):  # raised if there are too many pixels
         if _START_PATTERN.match(data):
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     # OpenCV has a different limit if a program imported it before edgevpr, so the size is checked here too.
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ImageError(

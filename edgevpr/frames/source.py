@@ -104,9 +104,10 @@ class FolderSource(RecordingSource):
         only: Collection[str] | None = None,
         *,
         steps_s: Sequence[float] = (),
+        upright: bool = True,
     ) -> None:
         super().__init__(only)
-        self._steps_s = iter(steps_s)
+        self._steps_s, self._upright = iter(steps_s), upright
         paths = {decode_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         self._tags = read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
@@ -126,7 +127,7 @@ class FolderSource(RecordingSource):
         if not self._unread:
             self.end()
         try:
-            image = self.stereo.refuse_stereo(read_image(path, self._depth))
+            image = self.stereo.refuse_stereo(read_image(path, self._depth, upright=self._upright))
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise
@@ -167,6 +168,7 @@ def open_source(
     clock: Callable[[], float] = time.monotonic,
     only: Collection[str] | None = None,
     steps_s: Sequence[float] = (),
+    upright: bool = True,
 ) -> Source:
     """Open the source at `uri`: a path, device or address.
 
@@ -175,14 +177,15 @@ def open_source(
     folder, the positions.csv in or next to it, else EXIF data; for a video, the .csv of the same name next to it).
     `live`: allow cameras and streams, which never end. A missing one is opened once it appears. `clock`: the
     monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
-    that is replayed at its original times, the result of `read_intervals`.
+    that is replayed at its original times, the result of `read_intervals`. `upright`: rotate the images of a folder by
+    their EXIF data (see `read_image`); not for a camera that looks straight down, where it shows no direction.
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
     if positions and is_live(uri):
         raise UsageError(f"{positions} is a position table for recordings, but {uri} is live: omit the table.")
     if os.path.isdir(uri):  # Path.is_dir raises OSError for a long pipeline
-        return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s)
+        return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s, upright=upright)
     if is_live(uri):
         if not live:
             raise SourceError(f"{uri} is live and never ends: use a folder of images or a video file instead.")

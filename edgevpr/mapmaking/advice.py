@@ -10,6 +10,7 @@ or of the aircraft itself, remain.
 import logging
 from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
+from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -21,12 +22,14 @@ from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import wrap_deg
-from edgevpr.core.text import show_elapsed
+from edgevpr.core.text import decode_name, show_elapsed
+from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
+from edgevpr.frames.level import Lens, level_image
 from edgevpr.frames.mask import OverlayMask
-from edgevpr.frames.positions import find_track, read_track
-from edgevpr.frames.source import Source, open_source, read_table, read_to_end
+from edgevpr.frames.positions import find_track
+from edgevpr.frames.source import Source, make_frame, open_source, read_table, read_to_end
 from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
 from edgevpr.runtime.recognise.agreement import MIN_PROVEN_INLIERS, measure_agreement
@@ -136,26 +139,52 @@ def require_one_lens(pictures: FlightPictures) -> None:
 
 
 @show_elapsed("measuring the tilt of the camera")
-def require_level_camera(pictures: FlightPictures, fov_deg: float | None) -> None:
-    """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted and its
-    angles are not recorded, because the pictures then cannot be levelled."""
-    if pictures.folder:
-        paths = [path for run in _choose_runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
-        tags = read_table(pictures.folder, pictures.positions)
-        if any(tag.pitch_deg is not None for path in paths for tag in (tags.get(path.name), read_xmp(path)) if tag):
-            return
-        tilt = measure_tilt(_read_usable(paths), fov_deg)
-    else:
-        table = pictures.positions or find_track(pictures.source)
-        if table and any(tag.pitch_deg is not None for tag in read_track(table).tags):
-            return
-        tilt = measure_tilt(_read_video(pictures.source, _TILT_VIDEO_PICTURES), fov_deg)
-    if tilt and tilt.deg > MAX_UNKNOWN_TILT_DEG:
+def require_level_camera(pictures: FlightPictures, lens: Lens | None) -> None:
+    """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted. With a
+    `lens`, they are levelled first by their recorded angles: a tilt that remains is not recorded, or wrongly."""
+    is_recorded = False
+
+    def read_level_images() -> Iterator[Image]:
+        nonlocal is_recorded
+        for frame in _read_tilt_frames(pictures):
+            angles = frame.roll_deg, frame.pitch_deg
+            is_recorded |= None not in angles
+            if lens is None:
+                # Images that are tilted more are left out of the map.
+                if all(abs(angle or 0.0) <= MAX_UNKNOWN_TILT_DEG for angle in angles):
+                    yield frame.image
+                continue
+            with suppress(ImageError):  # not turned north, so that the direction remains that in the camera
+                level = level_image(replace(frame, heading_deg=None), None, lens)
+                if level.view.reason is None:
+                    yield level.image
+
+    tilt = measure_tilt(read_level_images(), lens.fov_deg if lens else None)
+    if tilt is None or tilt.deg <= MAX_UNKNOWN_TILT_DEG:
+        return
+    measured = f"by {tilt.deg:.0f} degrees or more (measured from {tilt.pairs} pairs of neighbouring images)"
+    if is_recorded:
         raise UsageError(
-            f"The camera is tilted by {tilt.deg:.0f} degrees or more from straight down (measured from {tilt.pairs} "
-            "pairs of neighbouring images), and its angles are not recorded, so every position would be far off. Add "
-            "roll_deg and pitch_deg to the position table and pass --fov-deg, or pass --camera forward."
+            f"The camera is tilted {measured} from the direction that is recorded, so every position would be far off. "
+            "roll_deg (right wing down is positive) and pitch_deg (nose up) must be those of a camera that looks "
+            "straight down at 0, 0: correct their signs, or add the angle of its mount (source.mount_ahead_deg)."
         )
+    raise UsageError(
+        f"The camera is tilted {measured} from straight down, and its angles are not recorded, so every position would "
+        "be far off. Add roll_deg and pitch_deg to the position table and pass --fov-deg, or pass --camera forward."
+    )
+
+
+def _read_tilt_frames(pictures: FlightPictures) -> Iterator[Frame]:
+    """Yield some neighbouring pictures with their tags."""
+    if pictures.folder:
+        tags = read_table(pictures.folder, pictures.positions)
+        for path in (path for run in _choose_runs(pictures.folder, _TILT_RUN_LENGTH) for path in run):
+            for image in _read_usable([path], upright=False):
+                yield make_frame(image, path.name, 0.0, tags.get(decode_name(path.name)) or read_exif(path))
+    else:
+        with closing(replace(pictures, rate_hz=1.0).open(upright=False)) as video:
+            yield from islice(filter(None, read_to_end(video, lambda error: None)), _TILT_VIDEO_PICTURES)
 
 
 def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> tuple[bool, str]:
@@ -231,10 +260,10 @@ def _read_video(uri: str, count: int) -> Iterator[Image]:
         yield from (frame.image for frame in islice(filter(None, read_to_end(video, lambda error: None)), count))
 
 
-def _read_usable(paths: Iterable[Path]) -> Iterator[Image]:
+def _read_usable(paths: Iterable[Path], *, upright: bool = True) -> Iterator[Image]:
     for path in paths:
         with suppress(ImageError):
-            yield read_image(path)
+            yield read_image(path, upright=upright)
 
 
 def _choose_runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:

@@ -4,6 +4,7 @@
 import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,6 +76,13 @@ def refine_map(
             "mirror image of their positions, so %s was not refined; check the columns, then rebuild the map",
             place_map.path,
         )
+    if refined.common_offset_m:
+        _log.warning(
+            "the recorded positions are about %.0f m away from their images, always in the same direction from the "
+            "camera: it is tilted, or it triggers late. Record roll_deg and pitch_deg or set source.mount_ahead_deg "
+            "and source.mount_right_deg, or correct the times; until then, all fixes claim this error",
+            refined.common_offset_m,
+        )
     return refined
 
 
@@ -90,11 +98,14 @@ def calibrate_map(
     with _require_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
 
-    levelling = encoder.levelling
-    lens = levelling.lens if encoder.technique.spec.looks_down and isinstance(levelling, Levelling) else None
+    levelling, looks_down = encoder.levelling, encoder.technique.spec.looks_down
+    lens = levelling.lens if looks_down and isinstance(levelling, Levelling) else None
+    open_pictures = (
+        partial(pictures.open, upright=not looks_down) if isinstance(pictures, FlightPictures) else pictures.open
+    )
 
     def read(names: Collection[str] | None) -> Iterator[Frame]:
-        yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
+        yield from filter(None, read_to_end(open_pictures(names), lambda error: None))
 
     def frames(names: Collection[str]) -> Iterator[Frame]:
         first = next(read(names), None)

@@ -142,18 +142,20 @@ def _open_flight(
     """Open the pictures and create the technique. Raises UsageError if the camera looks straight down but `--camera` is
     missing, if a camera that should look straight down is tilted and its angles are not recorded, or if pictures of
     several lenses are to be levelled with one."""
-    source, settings, camera = pictures.open(), plan.parameters, config.camera
+    settings, camera = plan.parameters, config.camera
     name = _choose_name(plan, place_map)
     if camera is None and place_map is None and "camera" not in settings and make_camera_setting(name, "nadir"):
         advice.require_forward_camera(pictures, mask)
     if camera:  # a technique without this setting rejects it
         settings = settings | {"camera": camera}
     technique = _make_technique(plan, place_map, name, settings)
-    if technique.spec.looks_down and (config.fov_deg or config.lens):
-        advice.require_one_lens(pictures)
-    if technique.spec.looks_down and not config.gimbal and read_mount(config) == STRAIGHT_DOWN:
-        advice.require_level_camera(pictures, config.fov_deg)
-    return source, technique
+    if technique.spec.looks_down:
+        lens = read_camera_lens(config)
+        if lens:
+            advice.require_one_lens(pictures)
+        if not config.gimbal and (lens or read_mount(config) == STRAIGHT_DOWN):
+            advice.require_level_camera(pictures, lens)
+    return pictures.open(upright=not technique.spec.looks_down), technique
 
 
 def _open_orthophoto(

@@ -20,10 +20,10 @@ class FlightPictures:
     positions: Path | None = None
     rate_hz: float | None = None
 
-    def open(self, only: Collection[str] | None = None) -> Source:
-        """Open the source. Only pictures named in `only` are read (None: all)."""
+    def open(self, only: Collection[str] | None = None, *, upright: bool) -> Source:
+        """Open the source. Only pictures named in `only` are read (None: all). `upright` is as in `open_source`."""
         step_s = 1 / self.rate_hz if self.rate_hz else None
-        return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only)
+        return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only, upright=upright)
 
     @property
     def folder(self) -> Path | None:

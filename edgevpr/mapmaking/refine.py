@@ -29,6 +29,7 @@ from edgevpr.core.text import Progress, decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
+from edgevpr.mapmaking.offset import find_common_offset
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import find_inconsistent_tags
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVEN_INLIERS, Overlay, measure_agreement
@@ -84,7 +85,9 @@ class Refinement:
     deviations of refined positions, and of footprints (None: no place).
     `contradictory`: places whose recorded position contradicts the pictures (see `find_inconsistent_tags`): (place id,
     image, metres between recorded and refined position).
-    `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined."""
+    `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined.
+    `common_offset_m`: median of the distances from images to recorded positions due to an offset that all have in the
+    same direction from the camera (see `offset`; None: no such offset). It is part of the claimed accuracy."""
 
     places: int
     without_position: int
@@ -97,6 +100,7 @@ class Refinement:
     footprint_m: float | None = None
     contradictory: tuple[tuple[int, str, float], ...] = ()
     is_mirrored: bool = False
+    common_offset_m: float | None = None
 
 
 def refine(
@@ -132,22 +136,25 @@ def refine(
         solution = solve_graph(recorded, _to_ties(ties))
     is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solution)
     refined = _is_determined(solution) & (not is_mirrored)
-    _write_poses(place_map, refinable, positions, solution, refined)
-    moved_m = abs(solution.position - recorded)[refined]
+    moved_m, footprint_m = abs(solution.position - recorded)[refined], np.exp(solution.log.real)
     members = np.flatnonzero(refined)
+    offset = find_common_offset(recorded[refined], solution.position[refined], solution.log[refined])
+    position_var_m2 = solution.position_var / 2 + (offset * footprint_m) ** 2
+    _write_poses(place_map, refinable, positions, solution, position_var_m2, refined)
     return replace(
         result,
         refined=int(refined.sum()),
         ties=int(solution.ties_agree.sum()),
         recorded_sd_m=solution.recorded_sd_m,
         moved_m=_find_median(moved_m),
-        position_sd_m=_find_median(np.sqrt(solution.position_var[refined] / 2)),
-        footprint_m=_find_median(np.exp(solution.log.real[refined])),
+        position_sd_m=_find_median(np.sqrt(position_var_m2[refined])),
+        footprint_m=_find_median(footprint_m[refined]),
         contradictory=tuple(
             (refinable[members[row]].place_id, refinable[members[row]].source_image, float(moved_m[row]))
             for row in np.flatnonzero(find_inconsistent_tags(moved_m))
         ),
         is_mirrored=is_mirrored,
+        common_offset_m=float(np.median(offset * footprint_m[refined])) if offset else None,
     )
 
 
@@ -196,16 +203,21 @@ def _read_places(place_map: PlaceMap) -> Iterator[Place]:
 
 
 def _write_poses(
-    place_map: PlaceMap, refinable: list[Place], positions: list[Position], solution: GraphSolution, refined: Bools
+    place_map: PlaceMap,
+    refinable: list[Place],
+    positions: list[Position],
+    solution: GraphSolution,
+    position_var_m2: Floats,
+    refined: Bools,
 ) -> None:
-    """Write the solved positions and poses to the map for places where `refined`, bool (N,), is True. The others are
-    reset to their recorded positions, without a pose."""
+    """Write the solved positions, with their variances along one axis, and poses to the map for places where `refined`,
+    bool (N,), is True. The others are reset to their recorded positions, without a pose."""
     origin = positions[0]
     with place_map.transaction():
         for index, place in enumerate(refinable):
             position, pose = positions[index], None
             if refined[index]:
-                var_m2, offset_m = float(solution.position_var[index]) / 2, solution.position[index]
+                var_m2, offset_m = float(position_var_m2[index]), solution.position[index]
                 position = move_position(origin, offset_m.real, offset_m.imag)
                 pose = Pose(
                     up_deg=float(-np.degrees(solution.log[index].imag)) % 360,
@@ -281,7 +293,7 @@ def _make_comparer(
         if (path := paths.get(places[index].source_image)) is None:
             return None
         try:
-            descriptor = technique.encode(read_image(path))
+            descriptor = technique.encode(read_image(path, upright=False))
         except EdgevprError:
             return None
         return descriptor if place_map.has_descriptor(places[index].place_id, descriptor.coarse) else None

@@ -73,7 +73,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             log=replace(config.log, path=replay_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
             machine=tape_machine(Machine(measure_heat=ThermalWatch(hot_c=board.thermal_limit_c).read), playback),
-            open_source=lambda step_s: tape.ReplayedSource(playback, partial(_read_frame, folder)),
+            open_source=lambda *_: tape.ReplayedSource(playback, partial(_read_frame, folder)),
             turns=TapedTurns(Clock().mono_s, playback),
             drive=partial(tape.ReplayedDriver, playback),
             signing=tape.ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,

@@ -2,9 +2,11 @@
 
 from contextlib import nullcontext
 
+import numpy as np
 import photographs
 import pytest
 
+from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif, read_fov_deg
@@ -12,6 +14,7 @@ from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 from edgevpr.mapmaking.advice import require_one_lens
 from edgevpr.mapmaking.pictures import FlightPictures
+from edgevpr.places.mapfile import PlaceMap
 
 pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
 
@@ -87,6 +90,19 @@ def test_read_exif_reads_the_time_of_each_source(gps, camera, t_utc_s, tmp_path)
 def test_photograph_lying_on_its_side_is_set_upright(tmp_path):
     photographs.write_jpeg(tmp_path / "lying.jpg", image={0x0112: 6})
     assert read_image(tmp_path / "lying.jpg").shape == (64, 48, 3)
+
+
+@pytest.mark.parametrize("camera", ["nadir", "forward"])
+def test_map_build_sets_images_upright_only_for_a_camera_that_looks_ahead(camera, tmp_path):
+    stored = {}
+    for orientation in (1, 6):
+        folder, path = tmp_path / f"{orientation}", tmp_path / f"{orientation}.gpkg"
+        folder.mkdir()
+        photographs.write_jpeg(folder / "photo.jpg", image={0x0112: orientation})
+        assert main(["map", "build", str(path), "--images", str(folder), "--camera", camera]) == 0
+        with PlaceMap.open(path) as place_map:
+            stored[orientation], _ = place_map.read_fine_part(1)
+    assert np.array_equal(stored[1], stored[6]) == (camera == "nadir")
 
 
 @pytest.mark.parametrize(

@@ -180,6 +180,17 @@ def test_refine_refines_maps_of_any_kind_as_far_as_they_can_be(
             assert place.position == was, "a place that is not tied stays"
 
 
+def test_refine_reports_and_claims_an_offset_in_the_direction_of_the_camera(flown_dir, map_path, capsys):
+    _, poses = flown_dir
+    with PlaceMap.open_for_writing(map_path) as place_map, place_map.transaction():
+        for place, pose in zip(list(place_map.read_places()), poses, strict=True):
+            behind = -20 * np.exp(1j * np.radians(90 - pose.heading_deg))
+            place_map.move_place(place.place_id, move_position(place.position, behind.real, behind.imag), None)
+    refined = run_json(capsys, "map", "refine", map_path)
+    assert refined["common_offset_m"] == pytest.approx(20, abs=5)
+    assert refined["position_sd_m"] == pytest.approx(20, abs=5)
+
+
 @pytest.mark.data
 def test_refine_ties_images_by_votes_without_landmarks(tmp_path):
     folder = _DATA / "aerial_garfield28"

@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from edgevpr.core.errors import UsageError
+from edgevpr.frames.level import Lens
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 from edgevpr.mapmaking.advice import require_level_camera
 from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, MIN_PAIRS, measure_tilt
 
 CAMERA = Camera(width=320, height=240, focal_px=246.5, noise_sigma=0)
+LENS = Lens(66.0)
 LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 
 
@@ -54,8 +56,22 @@ def test_require_level_refuses_a_tilted_camera_whose_angles_are_not_recorded(gro
     pictures = FlightPictures(source=str(tmp_path))
     with pytest.raises(UsageError, match=r" \d\d degrees .*--fov-deg"):
         require_level_camera(pictures, None)
-    (tmp_path / "positions.csv").write_text("file,lat,lon,roll_deg,pitch_deg\n00.png,50,8,0,45\n")
-    require_level_camera(pictures, None)
+
+
+@pytest.mark.parametrize(
+    ("told_deg", "lens"), [(0, None), (0, LENS), (-45, LENS)], ids=["level", "level, lens", "sign"]
+)
+def test_require_level_refuses_a_camera_that_is_tilted_otherwise_than_recorded(ground, tmp_path, told_deg, lens):
+    lines = ["file,lat,lon,roll_deg,pitch_deg"]
+    for number, image in enumerate(fly(ground, 45)):
+        cv2.imwrite(str(tmp_path / f"{number:02}.png"), image)
+        lines.append(f"{number:02}.png,50,8,0,{told_deg}")
+    pictures = FlightPictures(source=str(tmp_path))
+    (tmp_path / "positions.csv").write_text("\n".join(lines))
+    with pytest.raises(UsageError, match=r"from the direction that is recorded.* signs"):
+        require_level_camera(pictures, lens)
+    (tmp_path / "positions.csv").write_text("\n".join(lines).replace(f"0,{told_deg}", "0,45"))
+    require_level_camera(pictures, LENS)
 
 
 def test_measure_tilt_is_unknown_without_overlap():

@@ -102,7 +102,8 @@ def answer_queries(
     spec = technique.spec
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
     sequence = options.sequence or spec.sequence
-    source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
+    meter = QueryMeter(load_board("this"))
+    source = open_source(str(dataset.ref_dir), live=False, upright=not spec.looks_down)
     # An unusable image raises ImageError, because figures that omit images would mislead.
     frames = filter(None, progress(read_to_end(source), source.total, f"{spec.name}: references"))
     with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
@@ -237,7 +238,7 @@ def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
     queries would mislead."""
     event = recogniser.step(
         Frame(
-            image=read_image(path),
+            image=read_image(path, upright=not recogniser.technique.spec.looks_down),
             name=path.name,
             t_mono_s=0.0,  # constant, so that there are no time gaps
             position=tag.position,

@@ -104,7 +104,7 @@ class Flight:
             navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, camera.gimbal)
             origin = find_origin(recogniser.place_map, camera) if settings.set_origin else None
             link = open_link(settings, io, navigator, origin, stack)
-            source = io.open_source(step_s)
+            source = io.open_source(step_s, not recogniser.technique.spec.looks_down)
             stack.callback(source.close)
             if link and not source.is_live and settings.send_fixes:
                 _log.warning("%s is a recording: its fixes are not positions of this vehicle", camera.uri)

@@ -58,16 +58,16 @@ _MAX_END_S = 4.0  # from a signal until a process that hangs is killed: systemd 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightIO:
     """Inputs and outputs of a flight. `place_map`: path of the map; `log`: settings of the flight log; `open_source`:
-    opens the source, given the seconds between two frames; `turns`, `drive` and `signing`: the link's turns, maker of
-    its driver, and packet signing; `status`: the status file; `recording`: its folder (None: no such file). All input
-    passes here; `boundary` records it or plays it back."""
+    opens the source, given the seconds between two frames, and `upright` as in `frames.source.open_source`; `turns`,
+    `drive` and `signing`: the link's turns, maker of its driver, and packet signing; `status`: the status file;
+    `recording`: its folder (None: no such file). All input passes here; `boundary` records it or plays it back."""
 
     board: Board
     place_map: str | None
     log: LogConfig
     clock: Clock
     machine: Machine
-    open_source: Callable[[float], Source]
+    open_source: Callable[[float, bool], Source]
     turns: Turns
     drive: DriverMaker
     signing: Signing
@@ -111,8 +111,8 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         status_path = config.status.file or find_default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
 
-        def open_paced(step_s: float) -> Source:
-            source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
+        def open_paced(step_s: float, upright: bool) -> Source:
+            source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s, upright=upright)
             if steps_s:
                 _log.info("playing %d pictures at their recorded times, over %.0f s", source.total, sum(steps_s))
             elif Path(uri).is_dir():
@@ -148,7 +148,7 @@ def record_io(io: FlightIO, recording: Recording) -> FlightIO:
         io,
         clock=tape_clock(io.clock, recording),
         machine=tape_machine(io.machine, recording),
-        open_source=lambda step_s: RecordedSource(io.open_source(step_s), recording, recording.store_frame),
+        open_source=lambda *how: RecordedSource(io.open_source(*how), recording, recording.store_frame),
         turns=turns,
         drive=partial(RecordedDriver, turns),
         stop=TapedStop(recording),
