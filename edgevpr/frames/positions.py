@@ -4,6 +4,7 @@ video time. The sources of frames read them. In this module, `where` is "FILE, l
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -30,6 +31,8 @@ _COLUMN_LIMITS = {
     "height_m": ALT_LIMITS_M,
     "rel_alt": ALT_LIMITS_M,
 }
+_SIGN_COLUMN = re.compile(r"(gps)?(lat|lon)\w*ref")
+_POSITION_WORD = re.compile(r"lat|lon|alt|height|yaw|pitch|roll|head")
 _TAG_COLUMNS = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m")
 _REQUIRED_COLUMNS = ("file", "lat", "lon")
 _TRACK_COLUMNS = ("time", "lat", "lon")
@@ -78,6 +81,13 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     return {row["file"]: _parse_tag(row, where) for where, row in _read_rows(csv_path)}
 
 
+def list_unread_columns(csv_path: str | Path) -> list[str]:
+    """List the columns of a table whose names are like those of positions, attitudes and heights, but not read. Raises
+    UsageError as `read_positions` does."""
+    rows = _read_rows(csv_path, ("lat", "lon"))
+    return [name for name in (rows[0][1] if rows else {}) if _POSITION_WORD.search(name) and name not in _COLUMN_LIMITS]
+
+
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
     """Write `tags`, by file name, to a positions.csv. `read_positions` returns exactly the same tags."""
     rows = [(name, *_to_numbers(tag), tag.t_utc_s) for name, tag in tags.items()]
@@ -117,6 +127,11 @@ def _read_rows(csv_path: str | Path, required: Sequence[str] = _REQUIRED_COLUMNS
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): choose a readable CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{csv_path} is not a CSV text file ({error}): save it as CSV in UTF-8.") from error
+    if signs := [name for name in header if _SIGN_COLUMN.fullmatch(name)]:
+        raise UsageError(
+            f"{csv_path} has a column `{signs[0]}`, but lat and lon must have signs (south and west negative): convert "
+            f"it with `edgevpr positions {csv_path} --images DIR`."
+        )
     for name in (*required, *_COLUMN_LIMITS, "time"):
         if header.count(name) > 1 or (name in required and name not in header):
             raise UsageError(

@@ -28,7 +28,7 @@ from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.level import Lens, level_image
 from edgevpr.frames.mask import OverlayMask
-from edgevpr.frames.positions import find_track
+from edgevpr.frames.positions import find_positions, find_track, list_unread_columns
 from edgevpr.frames.source import Source, make_frame, open_source, read_table, read_to_end
 from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
@@ -72,8 +72,10 @@ _MAX_STATIC_EDGES = 0.5  # fraction of all edges; if more are static, the camera
 def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> None:
     """Warn about what the map will lack. `total`: number of frames (0: unknown). `places`: number of places already in
     the map (None: the map will not be calibrated)."""
-    uri, has_position = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
+    uri, table = pictures.source, pictures.positions or find_track(pictures.source)
+    has_position = table is not None
     if pictures.folder:
+        table = pictures.positions or find_positions(pictures.folder)
         tags = read_table(pictures.folder, pictures.positions)
         paths = [path for run in _choose_runs(pictures.folder) for path in run]
         has_position = any((tags.get(path.name) or read_exif(path)).position for path in paths)
@@ -83,6 +85,9 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
         if total > _MAX_USEFUL_HZ * duration_s:
             text = "every frame of %s becomes a place (%d in %d s): pass --rate-hz 1 to make only %d"
             _log.warning(text, uri, total, duration_s, duration_s)
+    if table and (unread := list_unread_columns(table)):
+        text = "%s: not read: %s; the columns are lat, lon, alt, yaw_deg, roll_deg, pitch_deg and height_m"
+        _log.warning(text, table, ", ".join(unread))
     if not has_position:
         _log.warning(
             "no positions were found, and no fix can be sent without them: run edgevpr positions %s --images %s",

@@ -18,14 +18,20 @@ from edgevpr.tracks.record import Attitude, Record, make_tag
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _MAX_HEADER_ROWS = 10  # rows that are searched for the column names
-# Column names, reduced to letters; the first one that is present is used.
+# Column names, reduced to letters; the first one that is present is used. Those of exiftool's `Composite` group have a
+# sign; others may have it in a column `...Ref` of their own.
 _COLUMN_NAMES = {
     "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
-    "lat": ("latitude", "lat", "gpslatitude", "ylatitude"),
-    "lon": ("longitude", "lon", "lng", "long", "gpslongitude", "xlongitude"),
+    "lat": ("compositegpslatitude", "latitude", "lat", "gpslatitude", "ylatitude"),
+    "lon": ("compositegpslongitude", "longitude", "lon", "lng", "long", "gpslongitude", "xlongitude"),
+    "lat_ref": ("gpslatituderef", "gpsgpslatituderef", "latituderef", "latref"),
+    "lon_ref": ("gpslongituderef", "gpsgpslongituderef", "longituderef", "lonref"),
     "alt": ("altitude", "alt", "gpsaltitude", "absolutealtitude", "zaltitude", "elevation"),
     "height": ("relativealtitude", "relalt", "heightm", "height"),
-    "nose": ("yawdeg", "headingdeg", "yaw", "heading", "gpsimgdirection", "flightyawdegree"),
+    "nose": ("yawdeg", "headingdeg", "yaw", "heading", "gpsimgdirection", "gpsgpsimgdirection", "flightyawdegree"),
+    "nose_ref": ("gpsimgdirectionref", "gpsgpsimgdirectionref"),
+    "nose_roll": ("rolldeg",),
+    "nose_pitch": ("pitchdeg",),
     "yaw": ("gimbalyawdegree",),
     "pitch": ("gimbalpitchdegree",),
     "roll": ("gimbalrolldegree",),
@@ -36,6 +42,8 @@ _DEFAULT_COLUMNS = ("file", "lat", "lon", "alt")  # in Pix4D's order
 _OPENDRONEMAP_COLUMNS = ("file", "lon", "lat", "alt")
 _WGS84 = re.compile(r"epsg:4326|wgs\s?84|\+proj=(longlat|latlong)", re.IGNORECASE)
 _NON_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
+_OTHER_UNIT = re.compile(r"[\[(_ ](ft|feet|foot|rad|radians?)\b", re.IGNORECASE)
+_POSITION_WORD = re.compile(r"lat|lon|alt|height|yaw|pitch|roll|head|direction|omega|phi|kappa", re.IGNORECASE)
 _NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
 _PROJECTION = re.compile(r"epsg:\d+|wgs\s?84|\+proj=", re.IGNORECASE)
 
@@ -66,8 +74,13 @@ def read_table(path: Path) -> Record:
         else:
             continue
         used = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
+        if others := [names[column] for column in columns.values() if _OTHER_UNIT.search(names[column])]:
+            raise UsageError(f"{path}: `{others[0]}` must be in metres or degrees: convert it and rename the column.")
         tags = _read_rows(rows[first:], columns, path)
-        return Record(kind=f"table of {used}, separated by {separator_name}", tags_by_name=tags)
+        unused = [f"`{name}`" for index, name in enumerate(names) if index not in columns.values()]
+        unused = [name for name in unused if _POSITION_WORD.search(name)]
+        ignored = f"; not used: {', '.join(unused)}" if unused else ""
+        return Record(kind=f"table of {used}, separated by {separator_name}{ignored}", tags_by_name=tags)
     raise UsageError(f"{path}: no columns for image, latitude and longitude: name them file, lat and lon in line 1.")
 
 
@@ -86,8 +99,8 @@ def _find_columns(rows: Rows) -> Layout | None:
 def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
     """Return the column of the first of `choices`, else of an angle whose name ends with it (`vehicle latitude`)."""
     exact = [names.index(name) for name in choices if name in names]
-    is_angle = choices[0] in ("latitude", "longitude")
-    angles = [column for column, name in enumerate(names) if is_angle and name.endswith(choices[0])]
+    is_angle = choices[1:2] in (("latitude",), ("longitude",))
+    angles = [column for column, name in enumerate(names) if is_angle and name.endswith(choices[1])]
     return next(iter([*exact, *angles]), None)
 
 
@@ -108,10 +121,17 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
 
 def _parse_row(cells: Mapping[str, str]) -> GeoTag:
     """Make a tag from a row's cells; an impossible position becomes unknown. Raises ValueError for other text."""
-    values = {part: _parse_angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
-    attitude: Attitude = (values.get("nose"), None, None)
-    if {"yaw", "pitch", "roll"} <= values.keys():
-        attitude = to_nadir_angles(values["yaw"], values["pitch"], values["roll"])
+    refs = {part: cells.get(f"{part}_ref", "").upper()[:1] for part in ("lat", "lon", "nose")}
+    numbers = {part: text for part, text in cells.items() if part not in ("file", "time") and not part.endswith("_ref")}
+    values = {part: _parse_angle(text) for part, text in numbers.items() if text}
+    for part in ("lat", "lon"):
+        if refs[part] in ("S", "W") and part in values:
+            values[part] = -abs(values[part])
+    if refs["nose"] == "M":  # magnetic north
+        values.pop("nose", None)
+    attitude: Attitude = (values.get("nose"), values.get("nose_roll"), values.get("nose_pitch"))
+    if {"yaw", "pitch"} <= values.keys():
+        attitude = to_nadir_angles(values["yaw"], values["pitch"], values.get("roll", 0.0))
     tag = make_tag(values.get("lat"), values.get("lon"), values.get("alt"), attitude, values.get("height"))
     with suppress(KeyError, ValueError, OverflowError):  # no time, or an unreadable one
         return replace(tag, t_utc_s=parse_time(cells["time"]))

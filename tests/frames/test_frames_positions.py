@@ -6,7 +6,15 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Position
-from edgevpr.frames.positions import GeoTag, find_positions, parse_time, read_positions, read_track, write_positions
+from edgevpr.frames.positions import (
+    GeoTag,
+    find_positions,
+    list_unread_columns,
+    parse_time,
+    read_positions,
+    read_track,
+    write_positions,
+)
 
 HEADER = "file,split,lat,lon,alt,rel_alt,yaw_deg,time\n"
 FIRST_ROW = "0000.jpg,ref,46.84260708,-91.99455989,198.309,39.8,46.0,2016:06:23 16:31:59\n"
@@ -79,6 +87,17 @@ def test_parse_time_reads_each_format(text):
 def test_parse_time_refuses_other_text(text):
     with pytest.raises(ValueError):
         parse_time(text)
+
+
+@pytest.mark.parametrize("columns", ["lat,lat_ref,lon,lon_ref", "lat,GPSLatitudeRef,lon,GPSLongitudeRef"])
+def test_read_positions_refuses_signs_in_columns_of_their_own(columns, write_table):
+    with pytest.raises(UsageError, match=r"south and west negative.*edgevpr positions"):
+        read_positions(write_table(f"file,{columns}\na.jpg,46.8,S,91.9,W\n"))
+
+
+def test_list_unread_columns_names_only_those_that_look_like_ones_of_ours(write_table):
+    path = write_table("file,lat,lon,split,pitch,Height (ft),yaw_deg\na.jpg,46,8,ref,-45,130,10\n")
+    assert list_unread_columns(path) == ["pitch", "height (ft)"]
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,12 @@ def test_read_record_reads_each_subtitle_format(tmp_path, form):
         ("#Label,X/Longitude,Y/Latitude,Z/Altitude\na.JPG,8.5,50.25,120\n", (50.25, 8.5, 120)),
         ("EPSG:4326\na.JPG 8.5 50.25 120\n", (50.25, 8.5, 120)),
         ("a.JPG,50.25,8.5,120\nb.JPG,50.26,8.5,120\n", (50.25, 8.5, 120)),
+        ("SourceFile,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef\na.JPG,50.25,S,8.5,W\n",
+         (-50.25, -8.5, None)),
+        ("SourceFile,GPS:GPSLatitudeRef,GPS:GPSLatitude,GPS:GPSLongitudeRef,GPS:GPSLongitude\na.JPG,S,50.25,West,8.5\n",
+         (-50.25, -8.5, None)),
+        ("SourceFile,GPS:GPSLatitude,GPS:GPSLongitude,Composite:GPSLatitude,Composite:GPSLongitude\n"
+         "a.JPG,50,8,-50.25,-8.5\n", (-50.25, -8.5, None)),
         ("\ufefffile\tVehicle Latitude [deg]\tVehicle Longitude [deg]\na.JPG\t50.25 N\t8.5 E\n", (50.25, 8.5, None)),
     ],
 )  # fmt: skip
@@ -141,6 +147,24 @@ def test_read_record_reads_tables_of_other_programs(tmp_path, text, expected):
     at = record.tags_by_name["a.JPG"].position
     assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
     assert "separated by" in record.kind
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "expected", "unused"),
+    [
+        ("yaw_deg,roll_deg,pitch_deg", "10,2,-3", (10, 2, -3), None),
+        ("GimbalYawDegree,GimbalPitchDegree", "10,-45", (10, 0, 45), None),
+        ("GPSImgDirectionRef,GPSImgDirection", "M,10", (None,) * 3, None),
+        ("GPSImgDirectionRef,GPSImgDirection", "T,10", (10, None, None), None),
+        ("yaw,pitch,roll", "10,-45,0", (10, None, None), "`pitch`, `roll`"),
+    ],
+)
+def test_read_record_says_which_angles_of_a_table_it_does_not_read(tmp_path, columns, cells, expected, unused):
+    (tmp_path / "table.csv").write_text(f"file,lat,lon,{columns}\na.JPG,50,8,{cells}\n")
+    record = read_record(tmp_path / "table.csv")
+    tag = record.tags_by_name["a.JPG"]
+    assert (tag.heading_deg, tag.roll_deg, tag.pitch_deg) == pytest.approx(expected, abs=1e-6)
+    assert record.kind.endswith(f"; not used: {unused}" if unused else "commas")
 
 
 @pytest.mark.parametrize(("lat_deg", "is_accepted"), [(50.25, True), (50.26, False)])
@@ -159,6 +183,8 @@ def test_read_record_refuses_two_positions_for_a_name(tmp_path, lat_deg, is_acce
         ("t.csv", b"EPSG:32632\na.jpg 1 2 3\n", "WGS 84"),
         ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "is invalid"),
         ("t.csv", b"file,lat,lon\na.jpg,150,200\n", "swapped"),
+        ("t.csv", b"file,lat,lon,height (ft)\na.jpg,50,8,130\n", "metres"),
+        ("t.csv", b"file,lat,lon,yaw (rad)\na.jpg,50,8,0.8\n", "degrees"),
         ("t.csv", bytes(range(256)), "UTF-8"),
         ("t.bin", b"", "log"),
         ("t.bin", struct.pack("64x"), "no position"),
