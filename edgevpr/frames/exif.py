@@ -116,7 +116,9 @@ def _read_gps_time_s(tags: Tags) -> float:
 
 def _read_camera_time_s(tags: Tags) -> float:
     zone = tags["EXIF OffsetTimeOriginal"].values if "EXIF OffsetTimeOriginal" in tags else ""
-    return _parse_time_s(f"{tags['EXIF DateTimeOriginal'].values}{zone}")
+    digits = str(tags["EXIF SubSecTimeOriginal"].values).strip() if "EXIF SubSecTimeOriginal" in tags else ""
+    fraction_s = float(f"0.{digits}") if digits.isdecimal() else 0.0
+    return _parse_time_s(f"{tags['EXIF DateTimeOriginal'].values}{zone}") + fraction_s
 
 
 def _parse_time_s(text: str) -> float:

@@ -86,7 +86,7 @@ def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
 def _describe_landmarks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
     for path in paths:
         try:
-            yield detect_landmarks(read_image(path), None, _MAX_LANDMARKS)
+            yield detect_landmarks(read_image(path, upright=False), None, _MAX_LANDMARKS)
         except ImageError:
             yield None
 

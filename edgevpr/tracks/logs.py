@@ -4,6 +4,7 @@ attitude over time and, if the autopilot triggered the camera, for each picture.
 import os
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
+from dataclasses import replace
 from io import StringIO
 from math import degrees
 from pathlib import Path
@@ -44,7 +45,7 @@ def read_ardupilot(path: Path) -> Record:
                 angles_deg = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
             tag = make_tag(message.Lat, message.Lng, message.Alt, angles_deg, None if msg_type == "GPS" else height_m)
             lines[msg_type].append((message._timestamp, tag))
-    shots = tuple(tag for _, tag in lines["CAM"] or lines["TRIG"])
+    shots = tuple(replace(tag, t_utc_s=t_s) for t_s, tag in lines["CAM"] or lines["TRIG"])
     return Record(kind="ArduPilot log", track=make_track(path, lines["POS"] or lines["GPS"]), shots=shots)
 
 
@@ -65,7 +66,8 @@ def read_telemetry(path: Path) -> Record:
             attitude = degrees(message.yaw), degrees(message.roll), degrees(message.pitch)
         elif msg_type == "CAMERA_FEEDBACK":
             angles = message.yaw, message.roll, message.pitch
-            shots.append(make_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, angles, message.alt_rel))
+            tag = make_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, angles, message.alt_rel)
+            shots.append(replace(tag, t_utc_s=message._timestamp))
         else:
             heading = attitude or (None if message.hdg == _NO_HEADING else (message.hdg / 100, None, None))
             tag = make_tag(
@@ -103,7 +105,7 @@ def read_px4(path: Path) -> Record:
     except Exception as error:  # malformed files can raise anything
         raise UsageError(f"{path} cannot be read as a PX4 log ({error}): copy it from the autopilot again.") from error
     data = {topic.name: topic.data for topic in reversed(datasets) if len(topic.data["timestamp"])}  # first instance
-    shots = tuple(tag for _, tag in _read_positions(data, "camera_capture"))
+    shots = tuple(replace(tag, t_utc_s=t_s) for t_s, tag in _read_positions(data, "camera_capture"))
     return Record(kind="PX4 log", track=make_track(path, _read_positions(data, "vehicle_global_position")), shots=shots)
 
 

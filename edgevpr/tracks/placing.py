@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from edgevpr.frames.positions import GeoTag, Track
 from edgevpr.frames.video import read_start_s
 from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import Record
+from edgevpr.tracks.triggers import match_triggers
 
 _ZONE_STEP_S = 900  # time zones are multiples of a quarter of an hour
 _MAX_ZONE_STEPS = 4 * 14  # UTC offsets are at most 14 hours
@@ -43,14 +44,15 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
     paths = list_images(folder)
     exif_tags = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
     if record.tags_by_name:
-        tags, how = _match_names(record.tags_by_name, list(exif_tags)), "by name"
-    elif len(record.shots) == len(exif_tags):
-        tags, how = dict(zip(exif_tags, record.shots, strict=True)), "in the order of the autopilot's camera triggers"
+        tags, how = _match_names(record.tags_by_name, list(exif_tags), folder.absolute().name), "by name"
+    elif record.shots and offset_s is None and (matched := match_triggers(record.shots, exif_tags)):
+        tags, how = matched
     elif record.track and record.is_utc:
         return _match_times(record.track, folder, exif_tags, offset_s)
     elif record.shots:
         raise UsageError(
-            f"{len(record.shots)} camera triggers, but {len(exif_tags)} images in {folder}: keep only triggered ones."
+            f"{len(record.shots)} camera triggers do not fit the {len(exif_tags)} images in {folder}: keep only those "
+            "that were triggered."
         )
     else:
         raise UsageError(f"These positions ({record.kind}) belong to a video: pass that video as --images.")
@@ -60,11 +62,16 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
     return Placement(how=how, tags=tags, pictures=len(exif_tags))
 
 
-def _match_names(tags: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
-    """Match pictures by full name or else by name without extension, ignoring case."""
+def _match_names(tags: Mapping[str, GeoTag], names: list[str], folder: str) -> dict[str, GeoTag]:
+    """Match the pictures of a folder by their name, `FOLDER/NAME`, or these without extension, ignoring case."""
     tags_by_name = {name.casefold(): tag for name, tag in tags.items()}
-    tags_by_stem = {Path(name).stem.casefold(): tag for name, tag in tags.items()}
-    matches = {name: tags_by_name.get(name.casefold(), tags_by_stem.get(Path(name).stem.casefold())) for name in names}
+    tags_by_stem = {str(PurePosixPath(name).with_suffix("")): tag for name, tag in tags_by_name.items()}
+    matches = {}
+    for name in names:
+        choices = f"{folder}/{name}".casefold(), name.casefold()
+        stems = (str(PurePosixPath(choice).with_suffix("")) for choice in choices)
+        found = (*map(tags_by_name.get, choices), *map(tags_by_stem.get, stems))
+        matches[name] = next(filter(None, found), None)
     return {name: tag for name, tag in matches.items() if tag and tag.position}
 
 

@@ -20,7 +20,7 @@ class Record:
     `kind`: type of recording, in words. `track`: position and attitude over time (None: no times). `is_utc`: the
     times of the track are seconds since 1970; otherwise seconds from the first frame of the video that it belongs to.
     `shots`: what the autopilot logged for each picture that it triggered, in order. `tags_by_name`: position and
-    attitude by picture name, from a table that names pictures."""
+    attitude by picture name, from a table that names pictures; by `FOLDER/NAME` where a name is used in several."""
 
     kind: str
     track: Track | None = None

@@ -3,6 +3,7 @@
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -12,24 +13,21 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.frames.exif import to_nadir_angles
 from edgevpr.frames.images import is_image
-from edgevpr.frames.positions import GeoTag, parse_time
+from edgevpr.frames.positions import GeoTag, is_like_position, parse_time
 from edgevpr.tracks.record import Attitude, Record, make_tag
 
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _MAX_HEADER_ROWS = 10  # rows that are searched for the column names
 # Column names, reduced to letters; the first one that is present is used. Those of exiftool's `Composite` group have a
-# sign; others may have it in a column `...Ref` of their own.
+# sign; others may have it in another column, whose name ends with `Ref`.
 _COLUMN_NAMES = {
     "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
     "lat": ("compositegpslatitude", "latitude", "lat", "gpslatitude", "ylatitude"),
     "lon": ("compositegpslongitude", "longitude", "lon", "lng", "long", "gpslongitude", "xlongitude"),
-    "lat_ref": ("gpslatituderef", "gpsgpslatituderef", "latituderef", "latref"),
-    "lon_ref": ("gpslongituderef", "gpsgpslongituderef", "longituderef", "lonref"),
     "alt": ("altitude", "alt", "gpsaltitude", "absolutealtitude", "zaltitude", "elevation"),
     "height": ("relativealtitude", "relalt", "heightm", "height"),
-    "nose": ("yawdeg", "headingdeg", "yaw", "heading", "gpsimgdirection", "gpsgpsimgdirection", "flightyawdegree"),
-    "nose_ref": ("gpsimgdirectionref", "gpsgpsimgdirectionref"),
+    "nose": ("yawdeg", "headingdeg", "yaw", "heading", "flightyawdegree", "gpsimgdirection", "gpsgpsimgdirection"),
     "nose_roll": ("rolldeg",),
     "nose_pitch": ("pitchdeg",),
     "yaw": ("gimbalyawdegree",),
@@ -40,10 +38,9 @@ _COLUMN_NAMES = {
 _REQUIRED_COLUMNS = ("file", "lat", "lon")
 _DEFAULT_COLUMNS = ("file", "lat", "lon", "alt")  # in Pix4D's order
 _OPENDRONEMAP_COLUMNS = ("file", "lon", "lat", "alt")
-_WGS84 = re.compile(r"epsg:4326|wgs\s?84|\+proj=(longlat|latlong)", re.IGNORECASE)
+_WGS84 = re.compile(r"epsg:4326|wgs\s?84(?!\s*/?\s*utm)|\+proj=(longlat|latlong)", re.IGNORECASE)
 _NON_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
-_OTHER_UNIT = re.compile(r"[\[(_ ](ft|feet|foot|rad|radians?)\b", re.IGNORECASE)
-_POSITION_WORD = re.compile(r"lat|lon|alt|height|yaw|pitch|roll|head|direction|omega|phi|kappa", re.IGNORECASE)
+_OTHER_UNIT = re.compile(r"(?:\[|\(|_| )(ft|feet|foot|rad|radians?)[\])]?$", re.IGNORECASE)
 _NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
 _PROJECTION = re.compile(r"epsg:\d+|wgs\s?84|\+proj=", re.IGNORECASE)
 
@@ -77,8 +74,8 @@ def read_table(path: Path) -> Record:
         if others := [names[column] for column in columns.values() if _OTHER_UNIT.search(names[column])]:
             raise UsageError(f"{path}: `{others[0]}` must be in metres or degrees: convert it and rename the column.")
         tags = _read_rows(rows[first:], columns, path)
-        unused = [f"`{name}`" for index, name in enumerate(names) if index not in columns.values()]
-        unused = [name for name in unused if _POSITION_WORD.search(name)]
+        unused = [name for index, name in enumerate(names) if index not in columns.values()]
+        unused = [f"`{name}`" for name in unused if is_like_position(name)]
         ignored = f"; not used: {', '.join(unused)}" if unused else ""
         return Record(kind=f"table of {used}, separated by {separator_name}{ignored}", tags_by_name=tags)
     raise UsageError(f"{path}: no columns for image, latitude and longitude: name them file, lat and lon in line 1.")
@@ -90,6 +87,9 @@ def _find_columns(rows: Rows) -> Layout | None:
         names = [_NON_LETTERS.sub("", cell.lower()) for cell in row]
         indices = {part: _find_column(part_names, names) for part, part_names in _COLUMN_NAMES.items()}
         columns = {part: column for part, column in indices.items() if column is not None}
+        for part in ("lat", "lon", "nose"):
+            if part in columns and (ref := f"{names[columns[part]]}ref") in names:
+                columns[f"{part}_ref"] = names.index(ref)
         is_split = not any(separator in cell for cell in row for separator in ",;\t")
         if is_split and columns.keys() >= set(_REQUIRED_COLUMNS):
             return columns, index + 1, row
@@ -105,15 +105,20 @@ def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
 
 
 def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, GeoTag]:
-    tags: dict[str, GeoTag] = {}
+    """Return the tags by file name; by `FOLDER/NAME` where images of several folders have the same name."""
+    tags_by_path: dict[tuple[str, str], GeoTag] = {}
     for row in rows:
         cells = {part: row[column].strip() for part, column in columns.items() if column < len(row)}
         try:
-            name, tag = PureWindowsPath(cells["file"]).name, _parse_row(cells)
+            file, tag = PureWindowsPath(cells["file"]), _parse_row(cells)
         except (KeyError, ValueError) as error:
             raise UsageError(f"{path}: `{' '.join(row):.80}` is invalid ({error}): correct this line.") from error
-        if tags.setdefault(name, tag) != tag:
-            raise UsageError(f"{path} has two different rows for `{name}`: keep the one of the image in this folder.")
+        if tags_by_path.setdefault((file.parent.name, file.name), tag) != tag:
+            raise UsageError(
+                f"{path} has two different rows for `{file.name}`: keep the one of the image in this folder."
+            )
+    counts = Counter(name for _, name in tags_by_path)
+    tags = {f"{folder}/{name}" if counts[name] > 1 else name: tag for (folder, name), tag in tags_by_path.items()}
     if tags and not any(tag.position for tag in tags.values()):
         raise UsageError(f"{path} has no valid position: are latitude and longitude swapped, or not in degrees?")
     return tags

@@ -11,9 +11,11 @@ from PIL import Image
 from recordings import START_S, write_dataflash, write_gpx
 
 from edgevpr.core.geodesy import offset_position
-from edgevpr.frames.positions import read_positions
+from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import read_record
+from edgevpr.tracks.triggers import match_triggers
 
 SIDE_PX = 240
 GROUND_PX = 2400
@@ -51,12 +53,46 @@ def test_positions_assigns_images_by_name(capsys, folder, tmp_path):
     assert "already exists" in expect_refusal(capsys, "positions", tmp_path / "table.csv", "--images", folder)
 
 
+def make_shots(*times_s):
+    """Triggers at these times, each at a latitude of its own."""
+    return [(t_s, HOME[0] + 1e-3 * t_s, HOME[1], 120.0, 30.0, 0.0, 0.0, 0.0) for t_s in times_s]
+
+
 def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
-    write_dataflash(tmp_path / "f.bin", make_points(), shots=make_points(6, lat_step=1e-3))
+    write_dataflash(tmp_path / "f.bin", make_points(), shots=make_shots(*range(1, 13, 2)))
     found = run_json(capsys, "positions", tmp_path / "f.bin", "--images", folder)
     assert (found["placed"], found["of"], found["offset_s"]) == (6, 6, None)
     tags = read_positions(folder / "positions.csv")
-    assert [tag.position.lat_deg for tag in tags.values()] == pytest.approx([50 + 1e-3 * number for number in range(6)])
+    assert [tag.position.lat_deg for tag in tags.values()] == pytest.approx([50 + 1e-3 * t for t in range(1, 13, 2)])
+
+
+@pytest.mark.parametrize("clock_off_s", [0, -2.5e8], ids=["clock right", "clock never set"])
+@pytest.mark.parametrize(
+    ("taken_s", "names", "triggers_s", "placed_s"),
+    [
+        ((1, 4, 6, 11, 13, 16), (3, 4, 5, 0, 1, 2), (1, 4, 6, 11, 13, 16), (1, 4, 6, 11, 13, 16)),
+        ((-60, 1, 4, 6, 13, 16), range(6), (1, 4, 6, 11, 13, 16), (1, 4, 6, 13, 16)),
+        ((1, 4, 6, 11, 13), range(5), (1, 1, 4, 4, 6, 6, 11, 11, 13, 13), (1, 4, 6, 11, 13)),
+        ((1.0, 1.8, 2.6, 3.4, 4.2), range(5), (1.0, 1.8, 2.6, 3.4, 4.2), (1.0, 1.8, 2.6, 3.4, 4.2)),
+    ],
+    ids=["counter rolls over", "test image, one missed", "each trigger twice", "more than one a second"],
+)
+def test_match_triggers_goes_by_the_intervals(taken_s, names, triggers_s, placed_s, clock_off_s):
+    by_name = sorted(zip(names, taken_s, strict=True))
+    images = {f"{name}": GeoTag(t_utc_s=START_S + int(t_s) + clock_off_s) for name, t_s in by_name}
+    shots = [GeoTag(position=Position(t_s, 8.0), t_utc_s=START_S + t_s) for t_s in triggers_s]
+    tags, how = match_triggers(shots, images)
+    placed = {f"{name}": t_s for name, t_s in by_name if t_s in placed_s}
+    assert {name: tag.position.lat_deg for name, tag in tags.items()} == placed
+    assert ("by time" in how) == (list(names) != sorted(names))
+    assert ("1 of 6 images without" in how) == (len(placed) < len(images))
+
+
+@pytest.mark.parametrize("taken_s", [(1, 2, 3, 9, 11), (0, 1, 2, 3, 4, 5, 6)], ids=["other intervals", "too coarse"])
+def test_match_triggers_refuses_images_of_other_triggers(taken_s):
+    images = {f"{t_s}": GeoTag(t_utc_s=START_S + t_s) for t_s in taken_s}
+    shots = [GeoTag(t_utc_s=START_S + t_s) for t_s in np.linspace(1, 6, 5)]
+    assert match_triggers(shots, images) is None
 
 
 def test_positions_assigns_images_by_time_if_their_number_differs(capsys, folder, tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ulog
 
 from edgevpr.core.errors import UsageError
+from edgevpr.tracks.placing import place_pictures
 from edgevpr.tracks.record import read_record
 
 # seconds, lat, lon, alt, height, roll, pitch, yaw
@@ -134,8 +135,8 @@ def test_read_record_reads_each_subtitle_format(tmp_path, form):
         ("a.JPG,50.25,8.5,120\nb.JPG,50.26,8.5,120\n", (50.25, 8.5, 120)),
         ("SourceFile,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef\na.JPG,50.25,S,8.5,W\n",
          (-50.25, -8.5, None)),
-        ("SourceFile,GPS:GPSLatitudeRef,GPS:GPSLatitude,GPS:GPSLongitudeRef,GPS:GPSLongitude\na.JPG,S,50.25,West,8.5\n",
-         (-50.25, -8.5, None)),
+        ("SourceFile,EXIF:GPSLatitudeRef,EXIF:GPSLatitude,EXIF:GPSLongitudeRef,EXIF:GPSLongitude\n"
+         "a.JPG,South,50.25,West,8.5\n", (-50.25, -8.5, None)),
         ("SourceFile,GPS:GPSLatitude,GPS:GPSLongitude,Composite:GPSLatitude,Composite:GPSLongitude\n"
          "a.JPG,50,8,-50.25,-8.5\n", (-50.25, -8.5, None)),
         ("\ufefffile\tVehicle Latitude [deg]\tVehicle Longitude [deg]\na.JPG\t50.25 N\t8.5 E\n", (50.25, 8.5, None)),
@@ -155,6 +156,13 @@ def test_read_record_reads_tables_of_other_programs(tmp_path, text, expected):
         ("yaw_deg,roll_deg,pitch_deg", "10,2,-3", (10, 2, -3), None),
         ("GimbalYawDegree,GimbalPitchDegree", "10,-45", (10, 0, 45), None),
         ("GPSImgDirectionRef,GPSImgDirection", "M,10", (None,) * 3, None),
+        (
+            "GPSImgDirectionRef,GPSImgDirection,yaw_deg",
+            "M,10,20",
+            (20, None, None),
+            "`GPSImgDirectionRef`, `GPSImgDirection`",
+        ),
+        ("ExifImageHeight,RollingShutter,FlightYawDegree", "9,1,20", (20, None, None), None),
         ("GPSImgDirectionRef,GPSImgDirection", "T,10", (10, None, None), None),
         ("yaw,pitch,roll", "10,-45,0", (10, None, None), "`pitch`, `roll`"),
     ],
@@ -170,16 +178,34 @@ def test_read_record_says_which_angles_of_a_table_it_does_not_read(tmp_path, col
 @pytest.mark.parametrize(("lat_deg", "is_accepted"), [(50.25, True), (50.26, False)])
 def test_read_record_refuses_two_positions_for_a_name(tmp_path, lat_deg, is_accepted):
     (tmp_path / "table.csv").write_text(
-        f"SourceFile,GPSLatitude,GPSLongitude\nf/a.JPG,50.25,8.5\ng/a.JPG,{lat_deg},8.5\n"
+        f"SourceFile,GPSLatitude,GPSLongitude\nf/a.JPG,50.25,8.5\nf/a.JPG,{lat_deg},8.5\n"
     )
     with nullcontext() if is_accepted else pytest.raises(UsageError, match=r"two different rows for `a\.JPG`"):
         assert read_record(tmp_path / "table.csv").tags_by_name.keys() == {"a.JPG"}
+
+
+def test_place_pictures_goes_by_the_folder_where_names_repeat(tmp_path):
+    (tmp_path / "table.csv").write_text(
+        "SourceFile,GPSLatitude,GPSLongitude\nDCIM/100MEDIA/a.JPG,50,8\nDCIM/101MEDIA/a.JPG,51,8\nDCIM/b.JPG,52,8\n"
+    )
+    record = read_record(tmp_path / "table.csv")
+    for folder, lat_deg in (("100MEDIA", 50), ("101MEDIA", 51)):
+        (tmp_path / folder).mkdir()
+        for name in ("a.jpg", "b.tif"):
+            (tmp_path / folder / name).touch()
+        tags = place_pictures(record, tmp_path / folder, None).tags
+        assert [tag.position.lat_deg for tag in tags.values()] == [lat_deg, 52]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "a.jpg").touch()
+    with pytest.raises(UsageError, match="lists none of the images"):
+        place_pictures(record, tmp_path / "other", None)
 
 
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
         ("t.csv", b"file,x,y\na.jpg,1,2\n", "line 1"),
+        ("t.csv", b"WGS84 UTM 32N\na.jpg 500000 5500000 3\n", "WGS 84"),
         ("t.csv", b"EPSG:32632\na.jpg 1 2 3\n", "WGS 84"),
         ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "is invalid"),
         ("t.csv", b"file,lat,lon\na.jpg,150,200\n", "swapped"),
