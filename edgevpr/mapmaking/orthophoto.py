@@ -9,6 +9,7 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -36,12 +37,15 @@ except ModuleNotFoundError as error:
         f"Orthophotos require rasterio, and {error.name} is not installed: run `pip install rasterio scipy shapely`."
     ) from error
 
+_log = logging.getLogger(__name__)
 logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each fault once, in its own words
 
 _COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
 WGS84 = CRS.from_epsg(4326)
 _WEB_MERCATOR = CRS.from_epsg(3857)
 _WEB_MERCATOR_M = 2 * math.pi * 6_378_137.0  # its width
+_ALPHA_SAMPLE_PX = 512
+_MAX_GREY_ALPHA = 0.2  # of the pixels; a mask is grey at the edges of its data at most
 _EDGE_POINTS = 25  # per edge, because a straight edge of the file is a curve in another coordinate system
 _MAX_HALVINGS = 8  # of the resolution; eight reduce a tile of 256 pixels to one
 
@@ -73,6 +77,7 @@ class Orthophoto:
                 f"{self.name} cannot be opened as an orthophoto: use a GeoTIFF, VRT or MBTiles file."
             ) from error
         self._bands = self._find_colour_bands()
+        self._is_alpha_mask = self._check_alpha()
         self._locate()
 
     def _locate(self) -> None:
@@ -83,6 +88,12 @@ class Orthophoto:
         try:
             columns, rows = np.array([[self._data.width / 2], [self._data.height / 2]])
             (lon_deg,), (lat_deg,) = self._to_crs(columns, rows, WGS84)
+            if abs(lat_deg) > 90 or (crs.is_geographic and abs(lon_deg) > 360):
+                self.close()
+                raise SourceError(
+                    f"{self.name} says {crs.to_string()[:60]}, but its coordinates are not degrees: export it again in "
+                    "the coordinate system that they belong to."
+                )
             self.middle = Position(lat_deg, wrap_deg(lon_deg))
             lons_deg, lats_deg = self.compute_outline(WGS84)
         except (CPLE_BaseError, RasterioError):
@@ -120,6 +131,19 @@ class Orthophoto:
             self.close()
             raise SourceError(f"{self.name} is not a usable orthophoto: {fault}.")
         return colours
+
+    def _check_alpha(self) -> bool:
+        """Return False if the file's alpha band holds grey values, as near infrared that is labelled alpha does."""
+        if ColorInterp.alpha not in self._data.colorinterp:
+            return True
+        shape = tuple(min(side, _ALPHA_SAMPLE_PX) for side in (self._data.height, self._data.width))
+        with suppress(RasterioError):
+            alpha = self._data.read(self._data.colorinterp.index(ColorInterp.alpha) + 1, out_shape=shape)
+            if np.mean((alpha > 0) & (alpha < alpha.max())) > _MAX_GREY_ALPHA:
+                text = "%s: its alpha band holds grey values, such as near infrared, and is not used; black has no data"
+                _log.warning(text, self.name)
+                return False
+        return True
 
     def compute_outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
         """Return points along the edges of the file, x and y in the coordinate system `crs`, float64 (N,) each."""
@@ -195,7 +219,10 @@ class Orthophoto:
             bands = self._data.read(
                 self._bands, window=window, out_shape=(len(self._bands), *shape), resampling=Resampling.average
             )
-            valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
+            if self._is_alpha_mask:
+                valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
+            else:
+                valid = np.any(bands, axis=0)
         except RasterioError as error:
             raise ImageError(
                 f"{self.name} cannot be read at column {low[0]}, row {low[1]} ({error}): copy the file again."

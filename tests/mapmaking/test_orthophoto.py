@@ -109,11 +109,17 @@ def convert_marks(kind: str, bright: np.ndarray) -> tuple[np.ndarray, dict]:
         "alpha": (np.stack((byte, byte, byte, known)), {"photometric": "RGB", "alpha": "yes"}),
         "grey and alpha": (np.stack((byte, known)), {"alpha": "yes"}),
         "near infrared": (np.stack((byte, byte, byte, 255 - byte)), {"photometric": "RGB", "alpha": "no"}),
+        "near infrared as opacity": (
+            np.stack((byte, byte, byte, np.maximum(byte, 1) // 2)),
+            {"photometric": "RGB", "alpha": "yes"},
+        ),
         "nodata": (np.stack([empty] * 3), {"nodata": 0}),
     }[kind]
 
 
-@pytest.mark.parametrize("kind", ["grey", "alpha", "grey and alpha", "near infrared", "nodata"])
+@pytest.mark.parametrize(
+    "kind", ["grey", "alpha", "grey and alpha", "near infrared", "near infrared as opacity", "nodata"]
+)
 def test_orthophoto_reads_each_file_format(tmp_path, kind):
     to_crs, east_m, north_m = grid("EPSG:32632", 0.25, 640)
     bands, profile = convert_marks(kind, draw_marks(east_m, north_m))
@@ -156,6 +162,8 @@ def test_orthophoto_refuses_other_files_in_one_sentence(tmp_path):
     assert "gdal_translate -ot Byte" in read_refusal(deep)
     local = write_raster(tmp_path / "d.tif", byte, 'LOCAL_CS["site",UNIT["metre",1]]', to_crs)
     assert "latitude" in read_refusal(local)
+    metres = write_raster(tmp_path / "g.tif", byte, "EPSG:4326", to_crs)
+    assert "not degrees" in read_refusal(metres)
     palette = write_raster(tmp_path / "e.tif", byte, "EPSG:32632", to_crs, photometric="palette")
     with rasterio.open(palette, "r+") as data:
         data.write_colormap(1, {number: (number, 0, 0, 255) for number in range(256)})
