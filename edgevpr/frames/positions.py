@@ -31,8 +31,12 @@ _COLUMN_LIMITS = {
     "height_m": ALT_LIMITS_M,
     "rel_alt": ALT_LIMITS_M,
 }
-_SIGN_COLUMN = re.compile(r"(gps)?(lat|lon)\w*ref")
-_POSITION_WORD = re.compile(r"lat|lon|alt|height|yaw|pitch|roll|head")
+_SIGN_COLUMN = re.compile(r"(?:gps)?(lat|lon)\w*(?:ref|ns|ew)")
+_POSITION_NAME = re.compile(
+    r"(lat|latitude|lon|lng|longitude|alt|altitude|height|elevation|yaw|pitch|roll|heading|direction|omega|phi|kappa)"
+    r"(deg|degree|degrees|rad|m|ft|ref|ns|ew)?"
+)
+_PREFIXES = re.compile(r"(gps|gimbal|flight|camera|img|absolute|relative|rel|abs)+")
 _TAG_COLUMNS = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m")
 _REQUIRED_COLUMNS = ("file", "lat", "lon")
 _TRACK_COLUMNS = ("time", "lat", "lon")
@@ -85,7 +89,13 @@ def list_unread_columns(csv_path: str | Path) -> list[str]:
     """List the columns of a table whose names are like those of positions, attitudes and heights, but not read. Raises
     UsageError as `read_positions` does."""
     rows = _read_rows(csv_path, ("lat", "lon"))
-    return [name for name in (rows[0][1] if rows else {}) if _POSITION_WORD.search(name) and name not in _COLUMN_LIMITS]
+    return [name for name in (rows[0][1] if rows else {}) if is_like_position(name) and name not in _COLUMN_LIMITS]
+
+
+def is_like_position(name: str) -> bool:
+    """Return True if the name of a column is like that of a position, angle or height."""
+    letters = re.sub("[^a-z]", "", name.rpartition(":")[2].lower())
+    return bool(_POSITION_NAME.fullmatch(_PREFIXES.sub("", letters, count=1)))
 
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
@@ -127,11 +137,6 @@ def _read_rows(csv_path: str | Path, required: Sequence[str] = _REQUIRED_COLUMNS
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): choose a readable CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{csv_path} is not a CSV text file ({error}): save it as CSV in UTF-8.") from error
-    if signs := [name for name in header if _SIGN_COLUMN.fullmatch(name)]:
-        raise UsageError(
-            f"{csv_path} has a column `{signs[0]}`, but lat and lon must have signs (south and west negative): convert "
-            f"it with `edgevpr positions {csv_path} --images DIR`."
-        )
     for name in (*required, *_COLUMN_LIMITS, "time"):
         if header.count(name) > 1 or (name in required and name not in header):
             raise UsageError(
@@ -145,6 +150,13 @@ def _read_rows(csv_path: str | Path, required: Sequence[str] = _REQUIRED_COLUMNS
         record = {name: value.strip() for name, value in row.items()}
         if "file" in required and record["file"] in names:
             raise UsageError(f"{where}: `file` is `{record['file']}`, but must be a name not used on an earlier line.")
+        for name, cell in record.items():
+            sign = _SIGN_COLUMN.fullmatch(name)
+            if sign and cell[:1].upper() in ("S", "W") and not record[sign[1]].startswith("-"):
+                raise UsageError(
+                    f"{where}: {sign[1]} is `{record[sign[1]]}`, but {name} is `{cell}`: write south and west as "
+                    "negative numbers."
+                )
         names.add(record.get("file", ""))
         records.append((where, record))
     return records

@@ -177,8 +177,8 @@ def open_source(
     folder, the positions.csv in or next to it, else EXIF data; for a video, the .csv of the same name next to it).
     `live`: allow cameras and streams, which never end. A missing one is opened once it appears. `clock`: the
     monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
-    that is replayed at its original times, the result of `read_intervals`. `upright`: rotate the images of a folder by
-    their EXIF data (see `read_image`); not for a camera that looks straight down, where it shows no direction.
+    that is replayed at its original times, the result of `read_intervals`. `upright`: rotate single images
+    by their EXIF data (see `read_image`); not for a camera that looks straight down, where it shows no direction.
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
@@ -191,7 +191,7 @@ def open_source(
             raise SourceError(f"{uri} is live and never ends: use a folder of images or a video file instead.")
         from edgevpr.frames.live import LiveSource
 
-        return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
+        return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S, upright), clock)
     if not path.is_file():
         raise SourceError(f"{uri} does not exist: choose {SOURCE_HELP}.")
     if path.name.lower().endswith(EXTENSIONS):
@@ -241,7 +241,7 @@ def find_missing_cause(uri: str) -> str | None:
     return None
 
 
-def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
+def _make_capture(uri: str, clock: Callable[[], float], period_s: float, upright: bool) -> Callable[[], Capture]:
     """Return a function that opens the camera or stream `uri`. `period_s`: seconds between requests, if each image
     must be requested. Raises SourceError if opening can never succeed; a missing device or file may appear later."""
     if is_program_uri(uri):
@@ -268,6 +268,6 @@ def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Call
             return open_device(uri, clock)
         from edgevpr.frames.streams import open_address  # loads FFmpeg
 
-        return open_address(uri, clock, period_s)
+        return open_address(uri, clock, period_s, upright)
 
     return open_capture

@@ -34,9 +34,12 @@ _MAX_QUEUED_PACKETS = 2000
 _CLOSE_TIMEOUT_S = 0.5
 
 
-def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | SnapshotCapture":
+def open_address(
+    uri: str, clock: Callable[[], float], period_s: float, upright: bool = True
+) -> "StreamCapture | SnapshotCapture":
     """Open a network stream, an .sdp file, or the address of a single image, which is requested every `period_s`
-    seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
+    seconds and rotated by its EXIF data if `upright`. `clock` is the monotonic clock, in seconds. Raises OpeningError
+    with the cause."""
     opened_s = clock()
     response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
     content_type = response.headers.get_content_type() if response else ""
@@ -50,7 +53,7 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     if response:
         response.close()
     if content_type.startswith("image/"):
-        return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock)
+        return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock, upright=upright)
     if content_type == "text/html":
         raise OpeningError(f"no video at this address, only {content_type}")
     return StreamCapture(_open_stream(uri), clock, opened_s)

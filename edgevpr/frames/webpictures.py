@@ -63,8 +63,10 @@ class SnapshotCapture(Capture):
     is that of the request, when most cameras take it. A camera that returned the same file twice keeps an image ready,
     which may be as old as the previous request."""
 
-    def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
-        self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
+    def __init__(
+        self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float], *, upright: bool = True
+    ) -> None:
+        self._uri, self._timeout_s, self._clock, self._upright = uri, timeout_s, clock, upright
         self._period_s = min(period_s, _MAX_PERIOD_S)
         self._next_request_s = self._request_s = clock()
         self._data, self._is_buffered, self._depth = b"", False, DepthRange()
@@ -77,7 +79,7 @@ class SnapshotCapture(Capture):
             with send_request(self._uri, self._timeout_s) as response:
                 data = response.read(_MAX_BYTES)
             arrival_s = self._clock()
-            image = decode_image(data, "the snapshot", self._depth)
+            image = decode_image(data, "the snapshot", self._depth, upright=self._upright)
         except ImageError:
             return Refusal.DAMAGED
         except _REQUEST_ERRORS:

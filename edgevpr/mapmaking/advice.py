@@ -26,7 +26,7 @@ from edgevpr.core.text import decode_name, show_elapsed
 from edgevpr.core.types import Frame
 from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.level import Lens, level_image
+from edgevpr.frames.level import STRAIGHT_DOWN, Lens, level_image
 from edgevpr.frames.mask import OverlayMask
 from edgevpr.frames.positions import find_positions, find_track, list_unread_columns
 from edgevpr.frames.source import Source, make_frame, open_source, read_table, read_to_end
@@ -42,6 +42,8 @@ _RUN_LENGTH = 3
 _TILT_RUN_LENGTH = 12  # frames of a video are so close together that only every third or fourth shows motion
 _VIDEO_PICTURES = 10  # taken from a video, a second apart
 _TILT_VIDEO_PICTURES = 60
+_MAX_LEVEL_DEG = 5.0
+_MAX_WRONG_TILT_DEG = 25.0  # from a recorded direction: a slope in one direction looks like a tilt
 _MAX_LANDMARKS = 500
 # Chosen on corridor and grief_stromovka_seasons (forward: at most 12 degrees and 0.07 of vertical motion), and on
 # aerial_caliterra and aerial_garfield28. Yaw moves the scene sideways too, so nearly all pairs must show such motion.
@@ -86,7 +88,9 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
             text = "every frame of %s becomes a place (%d in %d s): pass --rate-hz 1 to make only %d"
             _log.warning(text, uri, total, duration_s, duration_s)
     if table and (unread := list_unread_columns(table)):
-        text = "%s: not read: %s; the columns are lat, lon, alt, yaw_deg, roll_deg, pitch_deg and height_m"
+        text = (
+            "%s: not read: %s; the columns are lat, lon, alt, yaw_deg (or heading_deg), roll_deg, pitch_deg, height_m"
+        )
         _log.warning(text, table, ", ".join(unread))
     if not has_position:
         _log.warning(
@@ -100,16 +104,24 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
 
 
 def suggest_lens(pictures: FlightPictures, config: SourceConfig, technique: Technique) -> None:
-    """If no field of view is configured, log the one in a picture's EXIF data: without it, pictures of a camera that
-    looks down can be neither levelled nor scaled."""
-    is_needed = technique.spec.parameters.get("camera") == "nadir" and config.fov_deg is None and config.lens is None
-    if (
-        is_needed
-        and pictures.folder
-        and (fov_deg := read_fov_deg(next(iter(list_images(pictures.folder))))) is not None
-    ):
+    """If no field of view is configured, log the one in the pictures' EXIF data: without it, pictures of a camera that
+    looks down can be neither levelled nor scaled. Warn if there are several."""
+    if technique.spec.parameters.get("camera") != "nadir" or config.fov_deg is not None or config.lens is not None:
+        return
+    if not (fovs_deg := _read_fovs_deg(pictures)):
+        return
+    if fovs_deg[-1] > _MAX_FOV_RATIO * fovs_deg[0]:
+        text = "EXIF: fields of view from %.0f to %.0f degrees: keep the images of one camera in a folder of their own"
+        _log.warning(text, fovs_deg[0], fovs_deg[-1])
+    else:
         text = "EXIF: field of view about %.0f deg: pass --fov-deg %.0f, here and in flight, for better positions"
-        _log.info(text, fov_deg, fov_deg)
+        _log.info(text, fovs_deg[0], fovs_deg[0])
+
+
+def _read_fovs_deg(pictures: FlightPictures) -> list[float]:
+    """Return the fields of view in the EXIF data of the pictures, ascending."""
+    paths = list_images(pictures.folder) if pictures.folder else []
+    return sorted(fov_deg for fov_deg in map(read_fov_deg, paths) if fov_deg is not None)
 
 
 @show_elapsed("checking where the camera points")
@@ -134,11 +146,10 @@ def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -
 def require_one_lens(pictures: FlightPictures) -> None:
     """Raise UsageError if the EXIF data of pictures that are to be levelled show different fields of view: with the one
     configured, the others would get a wrong scale."""
-    paths = list_images(pictures.folder) if pictures.folder else []
-    fovs_deg = [fov_deg for fov_deg in map(read_fov_deg, paths) if fov_deg is not None]
-    if fovs_deg and max(fovs_deg) > _MAX_FOV_RATIO * min(fovs_deg):
+    fovs_deg = _read_fovs_deg(pictures)
+    if fovs_deg and fovs_deg[-1] > _MAX_FOV_RATIO * fovs_deg[0]:
         raise UsageError(
-            f"The images have fields of view from {min(fovs_deg):.0f} to {max(fovs_deg):.0f} degrees (EXIF data), but "
+            f"The images have fields of view from {fovs_deg[0]:.0f} to {fovs_deg[-1]:.0f} degrees (EXIF data), but "
             "are levelled with one: keep those of one camera, without zoom, in a folder of their own."
         )
 
@@ -146,18 +157,19 @@ def require_one_lens(pictures: FlightPictures) -> None:
 @show_elapsed("measuring the tilt of the camera")
 def require_level_camera(pictures: FlightPictures, lens: Lens | None) -> None:
     """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted. With a
-    `lens`, they are levelled first by their recorded angles: a tilt that remains is not recorded, or wrongly."""
-    is_recorded = False
+    `lens`, they are levelled first by its mount and their recorded angles: a tilt that remains is not recorded, or
+    wrongly. Without one, pictures whose recorded angles are not near 0 are not compared."""
+    is_recorded = lens is not None and lens.mount != STRAIGHT_DOWN
 
     def read_level_images() -> Iterator[Image]:
         nonlocal is_recorded
         for frame in _read_tilt_frames(pictures):
-            angles = frame.roll_deg, frame.pitch_deg
-            is_recorded |= None not in angles
+            if frame.roll_deg is not None and frame.pitch_deg is not None:
+                is_recorded = True
+                if lens is None and max(abs(frame.roll_deg), abs(frame.pitch_deg)) > _MAX_LEVEL_DEG:
+                    continue
             if lens is None:
-                # Images that are tilted more are left out of the map.
-                if all(abs(angle or 0.0) <= MAX_UNKNOWN_TILT_DEG for angle in angles):
-                    yield frame.image
+                yield frame.image
                 continue
             with suppress(ImageError):  # not turned north, so that the direction remains that in the camera
                 level = level_image(replace(frame, heading_deg=None), None, lens)
@@ -165,18 +177,19 @@ def require_level_camera(pictures: FlightPictures, lens: Lens | None) -> None:
                     yield level.image
 
     tilt = measure_tilt(read_level_images(), lens.fov_deg if lens else None)
-    if tilt is None or tilt.deg <= MAX_UNKNOWN_TILT_DEG:
+    if tilt is None or tilt.deg <= (_MAX_WRONG_TILT_DEG if is_recorded else MAX_UNKNOWN_TILT_DEG):
         return
     measured = f"by {tilt.deg:.0f} degrees or more (measured from {tilt.pairs} pairs of neighbouring images)"
     if is_recorded:
         raise UsageError(
-            f"The camera is tilted {measured} from the direction that is recorded, so every position would be far off. "
-            "roll_deg (right wing down is positive) and pitch_deg (nose up) must be those of a camera that looks "
-            "straight down at 0, 0: correct their signs, or add the angle of its mount (source.mount_ahead_deg)."
+            f"The camera is tilted {measured} from the direction given by roll_deg (right wing down is positive), "
+            "pitch_deg (nose up) and source.mount_*, which are 0 straight down, so every position would be far off. "
+            "Correct them; if they are right and the ground is steep, set `source: {gimbal: true}` to skip this check."
         )
     raise UsageError(
         f"The camera is tilted {measured} from straight down, and its angles are not recorded, so every position would "
-        "be far off. Add roll_deg and pitch_deg to the position table and pass --fov-deg, or pass --camera forward."
+        "be far off. Add roll_deg and pitch_deg, both, to the position table and pass --fov-deg, or pass --camera "
+        "forward."
     )
 
 
@@ -218,12 +231,13 @@ def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> t
 
 
 @show_elapsed("checking for an on-screen display")
-def warn_of_display(pictures: FlightPictures, mask: OverlayMask | None) -> None:
-    """Warn if something in the pictures does not move where `mask` shows ground (None: everywhere)."""
+def warn_of_display(pictures: FlightPictures, mask: OverlayMask | None, *, upright: bool) -> None:
+    """Warn if something in the pictures does not move where `mask` shows ground (None: everywhere). `upright` is as in
+    `frames.source.open_source`."""
     if pictures.folder:
         paths = list_images(pictures.folder)
         indices = np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
-        images = _read_usable(paths[index] for index in indices)
+        images = _read_usable((paths[index] for index in indices), upright=upright)
     else:
         images = _read_video(pictures.source, _DISPLAY_PICTURES)
     fraction = measure_static_fraction(images, mask)

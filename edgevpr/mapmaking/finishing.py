@@ -79,8 +79,9 @@ def refine_map(
     if refined.common_offset_m:
         _log.warning(
             "the recorded positions are about %.0f m away from their images, always in the same direction from the "
-            "camera: it is tilted, or it triggers late. Record roll_deg and pitch_deg or set source.mount_ahead_deg "
-            "and source.mount_right_deg, or correct the times; until then, all fixes claim this error",
+            "camera: it is probably tilted, or triggers late. Record roll_deg and pitch_deg, set "
+            "source.mount_ahead_deg and source.mount_right_deg, or correct the times; until then, all fixes claim this "
+            "error",
             refined.common_offset_m,
         )
     return refined

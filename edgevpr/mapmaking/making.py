@@ -99,7 +99,7 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
                 will_calibrate = plan.calibrate and list_evidence_kinds(technique.spec)
                 advice.warn_of_gaps(pictures, source.total, len(place_map) if will_calibrate else None)
                 advice.suggest_lens(pictures, source_config, technique)
-                advice.warn_of_display(pictures, mask)
+                advice.warn_of_display(pictures, mask, upright=not technique.spec.looks_down)
                 if technique.spec.looks_down and (camera := read_camera_lens(source_config)):
                     frames = find_headings(frames, camera)
             else:
@@ -140,8 +140,8 @@ def _open_flight(
     plan: MapPlan, pictures: FlightPictures, config: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures and create the technique. Raises UsageError if the camera looks straight down but `--camera` is
-    missing, if a camera that should look straight down is tilted and its angles are not recorded, or if pictures of
-    several lenses are to be levelled with one."""
+    missing, if a camera that should look straight down is tilted otherwise than recorded, or if pictures of several
+    lenses are to be levelled with one."""
     settings, camera = plan.parameters, config.camera
     name = _choose_name(plan, place_map)
     if camera is None and place_map is None and "camera" not in settings and make_camera_setting(name, "nadir"):

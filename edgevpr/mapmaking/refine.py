@@ -139,6 +139,7 @@ def refine(
     moved_m, footprint_m = abs(solution.position - recorded)[refined], np.exp(solution.log.real)
     members = np.flatnonzero(refined)
     offset = find_common_offset(recorded[refined], solution.position[refined], solution.log[refined])
+    # The offset has the same length in any direction, so each axis gets all of it.
     position_var_m2 = solution.position_var / 2 + (offset * footprint_m) ** 2
     _write_poses(place_map, refinable, positions, solution, position_var_m2, refined)
     return replace(

@@ -297,7 +297,7 @@ class Autopilot:
                         self._choose_receiver(now_s),
                         is_trusted=self._listener.trusts_gps(),
                         version=self.selector.version,
-                        is_flying=bool(self.is_armed),
+                        is_armed=bool(self.is_armed),
                     )
             case "GLOBAL_POSITION_INT":
                 self._handle_position(message, now_s)

@@ -14,8 +14,8 @@ from edgevpr.mavlink.messages import MotionState
 from edgevpr.mavlink.wire import Message, mavlink
 
 _FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-_MIN_VERSION = (1, 16)
 _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+_FUSION_FLAG_VERSION = (1, 16)  # before, the first flag means a position from any source
 _SENSOR_TIMEOUT_S = 6.0  # after our last message 296, whose flag PX4 keeps set for 5 s
 _VISION_TIMEOUT_S = 1.0  # ODOMETRY has its own flag, so only the end of our messages must be detected
 _MIN_UNUSED_S = 2.0  # PX4 must not use a receiver with a fix for this long: the fix may be new or just lost
@@ -35,8 +35,7 @@ class Px4Fusion:
         self.used = self.unused = 0
         self._sent_s, self._is_vision = -math.inf, False
         self._unused_since_s: float | None = None
-        # Before 1.16 the flag means a position from any source.
-        self._reports_fusion = False
+        self._reports_fusion = False  # by the flag
         self._fuses_velocity = False
         self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
 
@@ -67,13 +66,13 @@ class Px4Fusion:
         *,
         is_trusted: bool = True,
         version: tuple[int, int] | None = None,
-        is_flying: bool = False,
+        is_armed: bool = False,
     ) -> None:
         """Process an ESTIMATOR_STATUS. `receiver`: the best GPS receiver with a fix (None: none has a fix).
-        `is_trusted`: False while matches prove that receiver wrong. `version`: of PX4 (None: unknown). `is_flying`:
-        False on the ground, where a PX4 that starts does not yet use its receiver."""
+        `is_trusted`: False while matches prove that receiver wrong. `version`: of PX4 (None: unknown). `is_armed`:
+        False while PX4 may be starting, when it does not yet use its receiver."""
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
-        self._reports_fusion |= is_fusing or (is_flying and version is not None and version >= _MIN_VERSION)
+        self._reports_fusion |= is_fusing or (is_armed and version is not None and version >= _FUSION_FLAG_VERSION)
         silent_s, timeout_s = now_s - self._sent_s, _VISION_TIMEOUT_S if self._is_vision else _SENSOR_TIMEOUT_S
         if silent_s < _SENDING_TIMEOUT_S:
             # A test ratio above 1 is outside the filter's gate.

@@ -7,14 +7,16 @@ import photographs
 import pytest
 
 from edgevpr.cli.main import main
+from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif, read_fov_deg
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
-from edgevpr.mapmaking.advice import require_one_lens
+from edgevpr.mapmaking.advice import require_one_lens, suggest_lens
 from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.techniques import create
 
 pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
 
@@ -92,6 +94,11 @@ def test_photograph_lying_on_its_side_is_set_upright(tmp_path):
     assert read_image(tmp_path / "lying.jpg").shape == (64, 48, 3)
 
 
+def test_read_exif_adds_the_fraction_of_the_second(tmp_path):
+    photographs.write_jpeg(tmp_path / "photo.jpg", camera={TAKEN: "2016:06:23 16:31:59", 0x9291: "25"})
+    assert read_exif(tmp_path / "photo.jpg").t_utc_s == T_UTC_S + 0.25
+
+
 @pytest.mark.parametrize("camera", ["nadir", "forward"])
 def test_map_build_sets_images_upright_only_for_a_camera_that_looks_ahead(camera, tmp_path):
     stored = {}
@@ -133,8 +140,12 @@ def test_fov_deg_of_is_that_of_the_equivalent_focal_length(focal_mm, sides, fov_
 
 
 @pytest.mark.parametrize(("focal_mm", "is_accepted"), [(24, True), (48, False)])
-def test_require_one_lens_refuses_wide_and_tele_pictures_in_one_folder(focal_mm, is_accepted, tmp_path):
+def test_map_build_refuses_and_reports_wide_and_tele_pictures_in_one_folder(focal_mm, is_accepted, tmp_path, caplog):
     for name, focal in (("a.jpg", 24), ("b.jpg", focal_mm)):
         photographs.write_jpeg(tmp_path / name, camera={0xA405: focal, 0xA002: 4000, 0xA003: 3000})
+    pictures = FlightPictures(source=str(tmp_path))
     with nullcontext() if is_accepted else pytest.raises(UsageError, match="from 40 to 72 degrees"):
-        require_one_lens(FlightPictures(source=str(tmp_path)))
+        require_one_lens(pictures)
+    caplog.set_level("INFO")
+    suggest_lens(pictures, SourceConfig(), create("cohog", {"camera": "nadir"}))
+    assert ("pass --fov-deg 72" if is_accepted else "from 40 to 72 degrees") in caplog.text

@@ -1,6 +1,7 @@
 """positions.csv, right and wrong."""
 
 import os
+from contextlib import nullcontext
 
 import pytest
 
@@ -89,15 +90,23 @@ def test_parse_time_refuses_other_text(text):
         parse_time(text)
 
 
-@pytest.mark.parametrize("columns", ["lat,lat_ref,lon,lon_ref", "lat,GPSLatitudeRef,lon,GPSLongitudeRef"])
-def test_read_positions_refuses_signs_in_columns_of_their_own(columns, write_table):
-    with pytest.raises(UsageError, match=r"south and west negative.*edgevpr positions"):
-        read_positions(write_table(f"file,{columns}\na.jpg,46.8,S,91.9,W\n"))
+@pytest.mark.parametrize(
+    "columns", ["lat,lat_ref,lon,lon_ref", "lat,GPSLatitudeRef,lon,GPSLongitudeRef", "lat,lat_ns,lon,lon_ew"]
+)
+@pytest.mark.parametrize(
+    ("cells", "is_accepted"),
+    [("46.8,S,91.9,W", False), ("46.8,N,91.9,West", False), ("-46.8,S,-91.9,W", True), ("46.8,N,91.9,E", True)],
+)
+def test_read_positions_refuses_signs_in_separate_columns(columns, cells, is_accepted, write_table):
+    path = write_table(f"file,{columns}\na.jpg,{cells}\n")
+    with nullcontext() if is_accepted else pytest.raises(UsageError, match=r"line 2: .* south and west as negative"):
+        read_positions(path)
 
 
 def test_list_unread_columns_names_only_those_that_look_like_ones_of_ours(write_table):
-    path = write_table("file,lat,lon,split,pitch,Height (ft),yaw_deg\na.jpg,46,8,ref,-45,130,10\n")
-    assert list_unread_columns(path) == ["pitch", "height (ft)"]
+    columns = "pitch,Height (ft),gimbal_pitch_deg,yaw_deg,platform,relative_time,image_height"
+    path = write_table(f"file,lat,lon,{columns}\na.jpg,46,8,-45,130,-45,10,p,3,480\n")
+    assert list_unread_columns(path) == ["pitch", "height (ft)", "gimbal_pitch_deg"]
 
 
 @pytest.mark.parametrize(

@@ -229,6 +229,13 @@ def test_restart_sends_to_a_px4_that_does_not_use_its_receiver(parameters):
     assert flight.fly(20).worst_m(flight.now_s - 20)[1] < 8
 
 
+def test_restart_does_not_send_to_an_older_px4_whose_use_of_gps_is_unknown():
+    flight = ClosedLoop("px4-copter", velocity_m_s=5j, **VISION)
+    flight.brain.version = 1 << 24 | 15 << 16
+    flight.fly(SETTLED_S).set("SIM_GPS_SPOOF", 1).fly(20)
+    assert not flight.start().fly(20).positions_sent(flight.now_s - 20)
+
+
 @pytest.mark.parametrize(
     ("vehicle", "parameters"),
     [
