@@ -58,7 +58,7 @@ def _hang_in_main(self, *_):
 
 
 if __name__ == "__main__":
-    source._make_capture = lambda uri, clock, period_s: HangingCapture
+    source._make_capture = lambda *_: HangingCapture
     if _STEP == "main":
         Flight._publish = _hang_in_main
     del sys.argv[1:3]
