@@ -72,7 +72,7 @@ def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
     if refined.surveyed:
         yield f"  surveyed    {refined.surveyed} cut from an orthophoto keep their position"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
-        yield f"  not linked  {not_tied} keep their recorded position: a fix there is only as accurate as the spacing"
+        yield f"  not linked  {not_tied} keep their recorded position, height and heading, which are less accurate"
     for place_id, image, distance_m in refined.contradictory:
         yield f"  GPS tag     place {place_id} ({sanitize(image)}): {distance_m:.0f} m from its refined position"
 
