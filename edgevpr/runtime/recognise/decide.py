@@ -247,6 +247,8 @@ class Decider:
                 self.relief.add(findings.located.footprint_m / query.view.footprint_m, best.place.place_id)
         evidence = findings.evidence
         confidence = confidence_rule.cap_confidence(evidence) if confidence_rule and evidence else None
+        if track and confidence_rule and evidence:
+            track = replace(track, confidence=confidence_rule.cap_confidence(evidence, track.confidence))
         return Decision(verdict=verdict, hints=hints, best=best, findings=findings, confidence=confidence, track=track)
 
     def _gather_findings(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:

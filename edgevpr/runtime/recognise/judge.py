@@ -82,9 +82,11 @@ class ConfidenceRule:
             return min(confidence, _MAX_TWIN_CONFIDENCE)
         return min(confidence, _MAX_UNPROVEN_CONFIDENCE) if evidence.needs_landmarks else confidence
 
-    def cap_confidence(self, evidence: Evidence) -> float:
-        """Return the confidence to report: at most the highest that the model's training data support."""
-        return min(self.confidence(evidence), self.models[evidence.kind].max_reported)
+    def cap_confidence(self, evidence: Evidence, confidence: float | None = None) -> float:
+        """Return the confidence to report: that of the evidence, or `confidence` of the track of the flight, at most
+        the highest that the model's training data support."""
+        confidence = self.confidence(evidence) if confidence is None else confidence
+        return min(confidence, self.models[evidence.kind].max_reported)
 
     def explain(self, evidence: Evidence) -> ReasonCode:
         """Return the code of a match with too low a confidence: what limits it, if its figures alone would suffice."""
@@ -249,7 +251,13 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed, reported = rule.confidence(evidence), rule.threshold(evidence), rule.cap_confidence(evidence)
-    figures = {"track_confidence": track, "confidence": reported, "min_confidence": needed, **evidence.describe()}
+    reported_track = None if track is None else rule.cap_confidence(evidence, track)
+    figures = {
+        "track_confidence": reported_track,
+        "confidence": reported,
+        "min_confidence": needed,
+        **evidence.describe(),
+    }
     is_confident = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
     raises_odds = track is not None and track * (1 - confidence) >= _MIN_ODDS_RATIO * confidence * (1 - track)

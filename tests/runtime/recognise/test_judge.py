@@ -69,6 +69,7 @@ def test_judge_requests_more_evidence_only_if_it_can_decide(confidence, of_map, 
 def test_cap_confidence_shows_no_more_than_the_data_support():
     rule = ConfidenceRule(dict.fromkeys(MAP_FIGURES, FixedModel(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
     assert (rule.confidence(CLEAR), rule.cap_confidence(CLEAR)) == (1.0, 0.9998)
+    assert (rule.cap_confidence(CLEAR, 0.9999999), rule.cap_confidence(CLEAR, 0.95)) == (0.9998, 0.95)
     down = make_accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).confidence_rule
     assert down.cap_confidence(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
 
