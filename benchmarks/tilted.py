@@ -27,7 +27,7 @@ ARIEL = "tilt_ariel"
 ARIEL_TILT_DEG = 45.0
 ARIEL_FOV_DEG = 70.0
 FOV_DEG = 28.0
-TILTS_DEG = (0.0, 20.0, 45.0, 60.0)
+TILTS_DEG = (0.0, 10.0, 20.0, 45.0, 60.0)
 _ANGLES = {"tilt": {}, "nothing": {"roll_deg": None, "pitch_deg": None}, "level": {"roll_deg": 0.0, "pitch_deg": 0.0}}
 _COLUMNS = {
     "tilt": "{tilt:.0f}",

@@ -204,7 +204,7 @@ class Navigator(Listener):
         if verdict.reason:
             return Advice(None, verdict.reason, is_held=True)
         self._navigation.correct_by_fix(predicted, verdict)
-        self._shared_sd_m = math.hypot(self._map_sd_m, time_error_m)
+        self._shared_sd_m = math.hypot(self._map_sd_m, time_error_m, located.common_tilt_m if located else 0.0)
         if match.attitude_error:
             self._attitude_error_s = match.t_s
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)

@@ -230,19 +230,20 @@ class Decider:
             # Last, because it encodes another image, and a technique caches only the views of its latest image.
             perspective = self._measure_perspective(best, query)
             tilt = convert_to_tilt(perspective, query.view.focal)
-            if query.view.is_tilt_known and self.common_tilt.mean.is_clear:
-                tilt = max(tilt, self.common_tilt.mean, key=lambda measured: measured.tangent * measured.is_clear)
             findings = replace(
                 findings,
                 # A few regions cannot refute a recorded tilt; a contradiction only adds to the reported error.
                 tilt=None if query.view.is_tilt_known else tilt,
-                located=add_tilt_covariance(findings.located, tilt, query.view) if findings.located else None,
                 unshifted_fraction=unshifted_fraction,
                 lead_over_other_rotation=lead,
             )
             verdict = judge(findings, index, rule, search)
             if verdict.accepted and perspective and query.view.is_tilt_known:
                 self.common_tilt.add(perspective, query.view, best.place.place_id)
+            if findings.located:
+                common_sd = self.common_tilt.sd if query.view.is_tilt_known else 0.0
+                single_sd = tilt.get_sd(query.view.is_tilt_known)
+                findings = replace(findings, located=add_tilt_covariance(findings.located, single_sd, common_sd))
             if verdict.accepted and query.view.footprint_m and findings.located and findings.located.footprint_m:
                 self.relief.add(findings.located.footprint_m / query.view.footprint_m, best.place.place_id)
         evidence = findings.evidence

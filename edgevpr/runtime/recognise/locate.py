@@ -18,7 +18,7 @@ from edgevpr.core.types import Candidate, Place, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
-from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, ObservedTilt, fit_attitude_error
+from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, fit_attitude_error
 from edgevpr.runtime.recognise.relief import UNKNOWN_HEIGHT_SD, compute_nadir_sd
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as fractions of the
@@ -46,7 +46,7 @@ class Located:
     ground, independent of any reported one (None: unknown). `places` are the numbers of the places that agree on the
     position. `objection` is the reason not to trust it (None: trusted). `attitude_error` is the error of the reported
     attitude measured in the picture; the position still contains its effect. `tilt_m2` is the part of both variances
-    due to an unreported tilt."""
+    due to an unreported tilt, and `common_tilt_m` the standard deviation due to one that all images have."""
 
     position: Position
     covariance_m2: Covariance
@@ -58,6 +58,7 @@ class Located:
     objection: Reason | None = None
     attitude_error: AttitudeError | None = None
     tilt_m2: float = 0.0
+    common_tilt_m: float = 0.0
 
     @property
     def accuracy_m(self) -> float:
@@ -157,12 +158,18 @@ def locate(
     )
 
 
-def add_tilt_covariance(located: Located, tilt: ObservedTilt, view: View) -> Located:
-    """Return the position with its covariance increased by the effect of `tilt` that remains after levelling."""
-    tangent_sd = tilt.get_sd(view.is_tilt_known)
-    tilt_m2 = (tangent_sd * (located.height_m or TYPICAL_FOCAL * (located.footprint_m or 0.0))) ** 2
+def add_tilt_covariance(located: Located, single_sd: float, common_sd: float) -> Located:
+    """Return the position with its covariance increased by the effect of the tilt that may remain after levelling.
+    Standard deviations, as tangents, of the tilt that this image shows, and of the one common to all images."""
+    height_m = located.height_m or TYPICAL_FOCAL * (located.footprint_m or 0.0)
+    tilt_m2 = (max(single_sd, common_sd) * height_m) ** 2
     east_m2, cross_m2, north_m2 = located.covariance_m2
-    return replace(located, covariance_m2=(east_m2 + tilt_m2, cross_m2, north_m2 + tilt_m2), tilt_m2=tilt_m2)
+    return replace(
+        located,
+        covariance_m2=(east_m2 + tilt_m2, cross_m2, north_m2 + tilt_m2),
+        tilt_m2=tilt_m2,
+        common_tilt_m=common_sd * height_m,
+    )
 
 
 def covariance_matrix(covariance: Covariance) -> Doubles:

@@ -10,6 +10,7 @@ import cmath
 import logging
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
@@ -38,6 +39,11 @@ _COMMON_TILT_SD = math.tan(math.radians(2.0))
 _SINGLE_TILT_SD = math.tan(math.radians(4.0))
 _MAX_TILT = math.tan(math.radians(60.0))  # a larger tilt is a wrong fit
 _COMMON_RELATIVE_SD = 0.15  # relative to the tilt: large tilts, which are mostly wrong, count little
+# Before any match: odds that a camera is tilted otherwise than reported, and the tilt of such a camera along each axis.
+_WRONG_MOUNT_ODDS = 0.5
+_WRONG_MOUNT_SD = math.tan(math.radians(10.0))
+_MAX_UNCLAIMED = 0.05  # probability that an error exceeds two standard deviations
+_MIN_WARNING_PROBABILITY = 0.95
 _DECAY = 0.98  # of the weight of earlier matches, per match: a gimbal may move
 # Relief moves neighbouring landmarks together, so this many count as one. The place's own picture is tilted too.
 _CORRELATED_LANDMARKS = 5.0
@@ -79,8 +85,8 @@ class ObservedTilt:
 
     def get_sd(self, is_reported: bool) -> float:
         """Return the standard deviation of the tilt used for levelling, as a tangent. A reported tilt is trusted unless
-        the pictures clearly contradict it. Without one, the error is the full measured tilt plus its measurement error,
-        because it is measured too small if only a few, clustered regions agree, as in the data set tilt_ariel."""
+        this picture clearly contradicts it. Without one, the error is the full measured tilt plus its error, because it
+        is measured too small if only a few, clustered regions agree, as in the data set tilt_ariel."""
         if is_reported:
             return math.hypot(self.tangent, self.sd) if self.is_clear else 0.0
         return self.tangent + self.sd
@@ -119,6 +125,34 @@ class CommonTilt:
             return ObservedTilt(0.0, _UNKNOWN_TILT_SD)
         return ObservedTilt(abs(self._weighted) / self._weight, self._weight**-0.5, _COMMON_TILT_SD)
 
+    @property
+    def probability(self) -> float:
+        """Probability that the camera is tilted otherwise than reported, given the mean so far: by Bayes' theorem, from
+        the probability densities of this mean with such a tilt and without one."""
+        mean, variance = self.mean, self._variance
+        total = variance + _WRONG_MOUNT_SD**2
+        odds = _WRONG_MOUNT_ODDS * variance / total * math.exp(mean.tangent**2 / 2 * (1 / variance - 1 / total))
+        return odds / (1 + odds)
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation of the reported tilt along any axis, as a tangent, given the mean so far. The tilt is
+        either as reported or not, so twice its root mean square may exceed less than 95 % of all cases: then it is half
+        of the tilt that does."""
+        probability = self.probability
+        trust = _WRONG_MOUNT_SD**2 / (self._variance + _WRONG_MOUNT_SD**2)
+        tangent, tangent_sd = trust * self.mean.tangent, math.sqrt(trust * self._variance)
+        root_mean_square = math.sqrt(probability) * math.hypot(tangent, tangent_sd)
+        if probability <= _MAX_UNCLAIMED:
+            return root_mean_square
+        quantile = tangent + tangent_sd * NormalDist().inv_cdf(1 - _MAX_UNCLAIMED / probability)
+        return max(root_mean_square, quantile / 2)
+
+    @property
+    def _variance(self) -> float:
+        """Variance of each axis of the mean."""
+        return self.mean.sd**2 + self.mean.place_sd**2
+
     def add(self, perspective: Perspective, view: View, place_id: int) -> None:
         """Add the perspective of an accepted match. A repeat of the previous place is ignored."""
         if place_id == self._place_id or view.focal is None:
@@ -132,7 +166,7 @@ class CommonTilt:
         weight = sd**-2
         self._weighted = _DECAY * self._weighted + weight * tilt
         self._weight = _DECAY * self._weight + weight
-        if self.mean.is_clear and not self._has_warned:
+        if self.probability >= _MIN_WARNING_PROBABILITY and not self._has_warned:
             self._has_warned = True
             _log.warning(
                 "the camera is tilted by about %.0f degrees more than reported: set source.mount_ahead_deg and "

@@ -216,3 +216,14 @@ def test_report_accuracy_contains_the_attitude_error_that_images_show(shown_sd, 
     assert navigator.report_accuracy(without_report).accuracy_m == reported.accuracy_m, "by the newest report"
     assert navigator.report_accuracy(unlocated) is unlocated
     assert Navigator(1.0, 1.0).report_accuracy(without_report) is without_report, "there is no report"
+
+
+@pytest.mark.parametrize("common_tilt_m", [0.0, 12.0])
+def test_positions_of_many_matches_claim_a_tilt_common_to_all(common_tilt_m):
+    navigator = Navigator(1.0, 1.0)
+    for t_s in map(float, range(1, 60)):
+        vehicle = make_vehicle(*HOME, t_s, has_gps=False, position_sd_m=30.0, velocity_m_s=(0.0, 0.0))
+        navigator.handle_vehicle(vehicle)
+        event = make_match(Position(*HOME), t_s, vehicle, 1.0, (1,))
+        navigator.advise(replace(event, located=replace(event.located, common_tilt_m=common_tilt_m)), t_s)
+    assert max(1.0, common_tilt_m) <= navigator.accuracy_m(t_s) < common_tilt_m + 2.0

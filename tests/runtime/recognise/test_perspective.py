@@ -132,20 +132,31 @@ def estimate_common_tilt(tilt, slope_of_ground, seed=5, count=6, place_ids=None)
         over_place[2, :2] = slope.real, slope.imag
         view = replace(SEEN, rotation_deg=turned_deg)
         common.add(Perspective(over_place, slope_sd=0.15, regions=40), view, (place_ids or range(count))[number])
-    return common.mean
+    return common
 
 
-def test_common_tilt_is_that_of_the_camera():
+def test_common_tilt_is_that_of_the_camera(caplog):
     found = estimate_common_tilt(0.3 - 0.2j, 0)
-    assert found.is_clear
-    assert found.deg == pytest.approx(math.degrees(math.atan(math.hypot(0.3, 0.2))), abs=5)
+    assert found.probability > 0.95
+    assert found.mean.deg == pytest.approx(math.degrees(math.atan(math.hypot(0.3, 0.2))), abs=5)
+    assert found.sd == pytest.approx(math.hypot(0.3, 0.2), abs=0.1)
+    assert caplog.text.count("set source.mount_ahead_deg") == 1
 
 
 @pytest.mark.parametrize("slope_of_ground", [0, 0.1])
-def test_common_tilt_of_a_level_camera_is_not_clear(slope_of_ground):
-    assert not any(estimate_common_tilt(0, slope_of_ground, seed, 12).is_clear for seed in range(20))
+def test_common_tilt_of_a_level_camera_is_not_claimed(slope_of_ground, caplog):
+    assert max(estimate_common_tilt(0, slope_of_ground, seed, 12).sd for seed in range(20)) < math.tan(math.radians(4))
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("tilt_deg", [8, 12, 20, 30])
+@pytest.mark.parametrize("count", [3, 12])
+def test_common_tilt_claims_what_it_cannot_exclude(tilt_deg, count):
+    tilt = math.tan(math.radians(tilt_deg))
+    found = [estimate_common_tilt(tilt, 0, seed, count) for seed in range(40)]
+    assert np.mean([tilt <= 2 * common.sd for common in found]) >= 0.8
 
 
 def test_common_tilt_counts_a_place_once():
-    assert estimate_common_tilt(0.15, 0, place_ids=[7] * 6).sd == estimate_common_tilt(0.15, 0, count=1).sd
-    assert not CommonTilt().mean.is_clear
+    assert estimate_common_tilt(0.15, 0, place_ids=[7] * 6).mean == estimate_common_tilt(0.15, 0, count=1).mean
+    assert CommonTilt().sd > 0
