@@ -40,7 +40,13 @@ from edgevpr.runtime.recognise.evidence import (
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.judge import AcceptRule, Findings, Verdict, is_unshifted, judge
 from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, QUERY_LANDMARKS, Landmarks, unpack_bytes
-from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, add_tilt_covariance, locate, locate_at_place
+from edgevpr.runtime.recognise.locate import (
+    MAX_PLACES_CHECKED,
+    add_tilt_covariance,
+    locate,
+    locate_at_place,
+    measure_distance_m,
+)
 from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.relief import Relief
@@ -272,7 +278,8 @@ class Decider:
                 )
                 located = locate(places, spec.cells, query.view, agreement, self.relief.height_sd)
                 if located is None and best.place.position:
-                    located = locate_at_place(best.place.position, self.accuracy_m)
+                    accuracy_m = max(self.accuracy_m, measure_distance_m(places, spec.cells))
+                    located = locate_at_place(best.place.position, accuracy_m)
         same_ground: Collection[int] = located.places if located else ()
         if agreement and not same_ground:
             with step("verify"):

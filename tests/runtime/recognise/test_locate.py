@@ -1,6 +1,7 @@
 """From matches to metres: positions, covariances, and what places must agree on."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from edgevpr.core.geodesy import offset_position, project_to_metres
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.locate import locate, locate_at_place
+from edgevpr.runtime.recognise.locate import locate, locate_at_place, measure_distance_m
 
 ORIGIN = Position(50.0, 8.0, 120.0)
 CELLS = 32
@@ -139,6 +140,18 @@ def test_locate_needs_a_pose_and_a_shift():
     assert locate([Candidate(make_candidate().place, FineMatch(0.5))], CELLS) is None
     assert locate([make_candidate()], None) is None, "ahead, a step says nothing about metres"
     assert locate_at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
+
+
+def test_measure_distance_takes_its_scale_from_places_of_the_same_ground():
+    """Above a point 30 m north of the first place and 18 m north of the second, whose image is turned by 90 degrees."""
+    first = make_candidate(1, shift=(0, -15))
+    second = make_candidate(2, shift=(9, 0), north_m=12.0, turned_deg=90.0)
+    other = make_candidate(3, shift=(10, 10), east_m=900.0, score=0.1)
+    assert measure_distance_m([first, second, other], CELLS) == pytest.approx(30.0, abs=0.01)
+    assert measure_distance_m([second, first], CELLS) == pytest.approx(18.0, abs=0.01)
+    assert measure_distance_m([first, other], CELLS) == 0.0, "its scale is unknown"
+    assert measure_distance_m([first, replace(first, place=second.place)], CELLS) == 0.0, "both at the same shift"
+    assert measure_distance_m([first, second], None) == 0.0, "ahead"
 
 
 def test_locate_rotates_the_covariance_of_the_place_to_the_ground():
