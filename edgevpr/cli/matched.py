@@ -1,5 +1,6 @@
 """Output of `edgevpr match`: the JSON object of a query, and the table and summary for people."""
 
+import math
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -7,39 +8,41 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import align_table, format_probability, sanitize
+from edgevpr.core.text import align_table, format_offset, format_probability, sanitize
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recognition import Recognition
 
 _NAME_COLUMNS = 17  # keeps a row at about 120 columns
 _REASON_COLUMNS = 48
+_MIN_OFFSETS = 5
 _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 
 
 def format_match(event: "Recognition") -> dict[str, Any]:
     """Return a query for `match --json`: the fields of its event, except that `position` is the fix (null: none) and
     the best place is one object (null: none was found). `of_place`: the fix is the position of the place itself,
-    because the offset from it is unknown. `on_map_m`: accuracy relative to the map. `from_gps_tag_m`: distance from the
-    fix to the query's own GPS tag; null if either is missing."""
-    from edgevpr.core.geodesy import distance_m
+    because the offset from it is unknown. `on_map_m`: accuracy relative to the map. `gps_tag_offset_m`: from the GPS
+    tag of the query to the fix, east and north, and `from_gps_tag_m` its length; null if either is missing."""
+    from edgevpr.core.geodesy import offset_between_m
     from edgevpr.runtime.recognise.recognition import to_fields
 
     fields = to_fields(event, exact=True)
     place_id, image, position = (fields.pop(name) for name in ("place", "reference_image", "position"))
     accuracy_m, fix, located = fields.pop("accuracy_m"), fields.pop("located"), event.located
-    tag, from_tag_m = event.frame and event.frame.position, None
+    tag, offset_m = event.frame and event.frame.position, None
     if fix and located:
         fix |= {"accuracy_m": accuracy_m, "on_map_m": round(located.accuracy_m, 2), "of_place": not fix["places"]}
         if tag:
-            from_tag_m = round(float(distance_m(tag.lat_deg, tag.lon_deg, fix["lat_deg"], fix["lon_deg"])), 2)
+            offset_m = [round(metres, 2) for metres in offset_between_m(tag, located.position)]
     unknown = dict.fromkeys(("lat_deg", "lon_deg", "alt_m"))
     first = {
         "query": fields.pop("query"),
         "accepted": fields.pop("accepted"),
         "reason": fields.pop("reason"),
         "position": fix,
-        "from_gps_tag_m": from_tag_m,
+        "from_gps_tag_m": offset_m and round(math.hypot(*offset_m), 2),
+        "gps_tag_offset_m": offset_m,
         "place": None if place_id is None else {"number": place_id, "image": image, **(position or unknown)},
     }
     return first | fields
@@ -102,5 +105,21 @@ def _summarise(matches: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]
     if from_tag_m := [match["from_gps_tag_m"] for match in fixes if match["from_gps_tag_m"] is not None]:
         text += f"; {median(from_tag_m):.1f} m from the GPS tags, which have errors of their own"
     yield text
+    offsets_m = [complex(*match["gps_tag_offset_m"]) for match in fixes if match["gps_tag_offset_m"]]
+    if offset_m := _find_common_offset(offsets_m, in_world_m):
+        yield (
+            f"the fixes lie {format_offset(offset_m.real, offset_m.imag)} of the GPS tags, nearly all alike: if the "
+            "tags are right, the map is displaced. A flight with GPS measures this; then run edgevpr map move"
+        )
     if of_place := sum(match["position"]["of_place"] for match in fixes):
         yield f"*: {of_place} positions are simply those of the matched places: the offset from the place is unknown"
+
+
+def _find_common_offset(offsets_m: Sequence[complex], claimed_m: float) -> complex | None:
+    """Return the median offset (east + north j) if it is larger than `claimed_m` and the scatter of the offsets allow;
+    None if it is not, or there are too few."""
+    if len(offsets_m) < _MIN_OFFSETS:
+        return None
+    middle_m = complex(median(each.real for each in offsets_m), median(each.imag for each in offsets_m))
+    scatter_m = median(abs(each - middle_m) for each in offsets_m)
+    return middle_m if abs(middle_m) > max(2 * claimed_m, 3 * scatter_m) else None

@@ -51,6 +51,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
         if fix:
             away_m = distance_m(at.lat_deg, at.lon_deg, fix["lat_deg"], fix["lon_deg"])
             assert away_m == pytest.approx(query["from_gps_tag_m"], abs=0.01)
+            assert away_m == pytest.approx(np.hypot(*query["gps_tag_offset_m"]), abs=0.01)
             assert away_m < 3, "places are 40 m apart: it is the fix, and not the place"
             assert not fix["of_place"]
     assert sum(query["accepted"] for query in found) >= 3
