@@ -11,8 +11,9 @@ published data sets by their files:
 import csv
 import io
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from filecmp import cmp
 from pathlib import Path
 
 import numpy as np
@@ -48,12 +49,14 @@ class ScoredQuery:
 @dataclass(frozen=True, slots=True)
 class Dataset:
     """A data set: its scored `queries`, and the folder `ref_dir` of its references. `references` are the file names of
-    all images in that folder, in mapping order. `unscored`: number of query images without ground truth."""
+    all images in that folder, in mapping order. `unscored`: number of query images without ground truth.
+    `copied`: number of scored queries whose file is also a reference, so that they test nothing."""
 
     queries: tuple[ScoredQuery, ...]
     ref_dir: Path
     references: tuple[str, ...]
     unscored: int = 0
+    copied: int = 0
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
@@ -77,7 +80,16 @@ def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth,
     queries = tuple(ScoredQuery(paths[name], *answers) for name, answers in truth.items() if answers)
     if not queries:
         raise UsageError(f"{origin} has no query to score: add a row with the status `ok` or `novel`.")
-    return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries))
+    copied = _count_copies((query.path for query in queries), list_images(ref_dir))
+    return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries), copied)
+
+
+def _count_copies(paths: Iterable[Path], references: Iterable[Path]) -> int:
+    """Return the number of `paths` whose file has the same content as one of `references`."""
+    by_size: dict[int, list[Path]] = {}
+    for reference in references:
+        by_size.setdefault(reference.stat().st_size, []).append(reference)
+    return sum(any(cmp(path, other, shallow=False) for other in by_size.get(path.stat().st_size, [])) for path in paths)
 
 
 def list_names(folder: str | Path) -> tuple[str, ...]:

@@ -189,6 +189,7 @@ def summarise(
         parameters=technique.spec.parameters,
         references=references,
         unscored=dataset.unscored,
+        queries_copied=dataset.copied,
         not_done=not_done,
         **metrics.compute_quality(
             *(np.array([getattr(answer, name) for answer in answers]) for name in ("score", "first_right", "has_match"))

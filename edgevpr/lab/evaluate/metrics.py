@@ -52,6 +52,7 @@ class TechniqueResult(Figures):
 
     `queries_off_map` of the queries have no place in the map, so all their matches are wrong. `with_match` are the
     figures of the others alone (None: all queries, or none). `unscored` queries have no ground truth.
+    `queries_copied` are also references.
 
     `accepted`, `accepted_wrong`, `accepted_off_map`, `accepted_elsewhere` and `discarded` count queries by the fields
     of `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for
@@ -67,6 +68,7 @@ class TechniqueResult(Figures):
     references: int
     queries_off_map: int = 0
     unscored: int = 0
+    queries_copied: int = 0
     with_match: Figures | None = None
     parameters: dict[str, int | float | str]
     accepted: int

@@ -103,6 +103,8 @@ def _list_notes(results: Sequence[TechniqueResult]) -> Iterator[str]:
     yield f"{first.queries_off_map} of them are off the map: their place is not in it, so every match is wrong."
     if first.unscored:
         yield f"{first.unscored} more queries have no ground truth and are not scored."
+    if first.queries_copied:
+        yield f"{first.queries_copied} of them are also references (the same file): they test nothing; leave them out."
     yield from ABOUT_FIGURES
     for result in results:
         if result.sequence > 1:

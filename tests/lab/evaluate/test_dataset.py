@@ -45,6 +45,15 @@ def test_load_dataset_reads_a_query_off_the_map(folder, row):
     assert dataset.unscored == 1
 
 
+def test_load_dataset_counts_scored_queries_that_are_copies_of_references(folder):
+    for number, name in enumerate(("a.png", "b.png", "c.png")):
+        (folder / "ref" / name).write_bytes(b"same size %d" % number)
+    (folder / "query" / "a.png").write_bytes(b"same size 2")
+    (folder / "query" / "b.png").write_bytes(b"same size 7")
+    (folder / "query" / "c.png").write_bytes(b"same size 1")
+    assert load(folder, "query_file,ref_files\na.png,c.png\nb.png,b.png\n").copied == 1
+
+
 def test_load_dataset_reads_a_spreadsheet_export_without_some_queries(folder):
     dataset = load(folder, b"\xef\xbb\xbfquery_file,ref_files\r\n b.png , b.png \r\n\r\n")
     assert [(query.path.name, query.correct) for query in dataset.queries] == [("b.png", {"b.png"})]
