@@ -93,17 +93,19 @@ class Album:
         return next((picture for finder in self._finders if (picture := finder(name))), None)
 
 
-def _read_picture(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPicture | None:
+def _read_picture(
+    path: Path, tag: Callable[[], GeoTag | None] | None = None, *, upright: bool = True
+) -> AlbumPicture | None:
     with suppress(ImageError, OSError, ValueError):  # not a picture, or an invalid file name
         if path.is_file():
-            return AlbumPicture(read_image(path), tag=tag)
+            return AlbumPicture(read_image(path, upright=upright), tag=tag)
     return None
 
 
-def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
+def _find_in_folder(folder: Path, upright: bool, name: str) -> AlbumPicture | None:
     # A log from someone else may name any file on this machine, so show only files in the folder.
     path = folder / Path(name).name
-    return _read_picture(path, lambda: _read_folder_tags(folder).get(path))
+    return _read_picture(path, lambda: _read_folder_tags(folder).get(path), upright=upright)
 
 
 @cache
@@ -155,9 +157,12 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
     return find
 
 
-def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
+def make_album(
+    sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({}), *, upright: bool = True
+) -> Album:
     """Return the album of the pictures in `sources`, folders or one video. `recorded`: files of a recording by frame
-    name, which are searched first. Raises EdgevprError for a source that cannot be used."""
+    name, which are searched first. `upright`: see `read_image`. Raises EdgevprError for a source that cannot be
+    used."""
     finders: list[Finder] = []
     if recorded:
         finders.append(lambda name: _read_picture(recorded[name]) if name in recorded else None)
@@ -166,7 +171,7 @@ def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = Map
     for folder in map(Path, sources):
         if not folder.is_dir():
             raise UsageError(f"{folder} does not exist: pass a folder of images, or a video.")
-        finders.append(partial(_find_in_folder, folder.resolve()))
+        finders.append(partial(_find_in_folder, folder.resolve(), upright))
     return Album(*finders)
 
 
@@ -175,7 +180,9 @@ def make_map_album(sources: Sequence[str | Path], places: Sequence[Place]) -> Al
     map was cut. Raises EdgevprError for a source that cannot be used."""
     if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
         return Album(_open_orthophoto(sources[0], places))
-    return make_album(sources)
+    return make_album(
+        sources, upright=not any(place.pose for place in places)
+    )  # only a camera that looks down has poses
 
 
 def embed_pictures(

@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from ground import write_places
+from PIL import Image
 from rasters import HOME, write_textured_raster
 
 from edgevpr.core.types import Place, Pose
@@ -12,6 +14,7 @@ from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.review.album import embed_pictures, make_album, make_map_album
 
 LENS = Lens(60.0)
+POSE = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0))
 
 
 def test_align_picture_returns_the_image_in_the_orientation_of_the_pose(tmp_path):
@@ -27,9 +30,18 @@ def test_align_picture_returns_the_image_in_the_orientation_of_the_pose(tmp_path
     assert album.align_picture(replace(turned, source_image="gone.png"), LENS) is None
 
 
+@pytest.mark.parametrize(("pose", "is_turned"), [(None, True), (POSE, False)], ids=["ahead", "down"])
+def test_make_map_album_turns_only_images_of_a_camera_that_looks_ahead(tmp_path, pose, is_turned):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera's right side is up
+    Image.fromarray(np.full((60, 80, 3), 128, np.uint8)).save(tmp_path / "photo.jpg", exif=exif)
+    album = make_map_album([tmp_path], [Place(place_id=1, source_image="photo.jpg", position=HOME, pose=pose)])
+    assert album.find_image("photo.jpg").shape[:2] == ((80, 60) if is_turned else (60, 80))
+
+
 def test_make_map_album_cuts_the_pictures_of_an_orthophoto_again(tmp_path):
     pytest.importorskip("rasterio")
-    pose = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
+    pose = replace(POSE, is_surveyed=True)
     places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
     album = make_map_album([write_textured_raster(tmp_path / "town.tif")], places)
     assert album.find_image("town.tif_r000_c000").std() > 10
