@@ -24,7 +24,7 @@ SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
 FROM places
 """
 _MIN_COURSES = 10
-_MAX_PASS_STEPS = 3.0  # longest time between successive places of one pass over the ground, as a multiple of the median
+_MAX_PASS_STEPS = 3.0  # longest time or distance between successive places of one pass, as a multiple of the median
 _MIN_COURSE_LENGTH = 0.9  # of the mean of the unit vectors along the courses, if all are in one direction
 _MAX_SIGMA = 4.0  # standard deviations per axis between a tag and the true position of its picture
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a normally distributed 2D vector, in standard deviations per axis
@@ -93,19 +93,23 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
 
 def _find_one_way_deg(place_map: PlaceMap) -> float | None:
     """Return the course over ground, degrees, if all places were mapped in roughly one direction; None if not, or if
-    their times are unknown."""
+    they are cut from an orthophoto. Places without times count as mapped in the order of the map."""
     tags: list[tuple[float, float, float]] = []
     with suppress(PlaceError):  # the places before a damaged one are enough
         for place in place_map.read_places():
-            if place.t_utc_s is not None and place.position:
-                tags.append((place.t_utc_s, place.position.lat_deg, place.position.lon_deg))
+            if place.position and not (place.pose and place.pose.is_surveyed):
+                t_s = math.nan if place.t_utc_s is None else place.t_utc_s
+                tags.append((t_s, place.position.lat_deg, place.position.lon_deg))
     if len(tags) <= _MIN_COURSES:
         return None
-    t_s, lat_deg, lon_deg = np.array(sorted(tags)).T
-    step_s = np.diff(t_s)
+    t_s, lat_deg, lon_deg = np.array(tags).T
+    has_times = not np.isnan(t_s).any()
+    order = np.argsort(t_s, kind="stable") if has_times else np.arange(len(tags))
+    lat_deg, lon_deg = lat_deg[order], lon_deg[order]
     east_m, north_m = offset_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
     step_m = east_m + 1j * north_m
-    courses = step_m[(step_s <= _MAX_PASS_STEPS * np.median(step_s)) & (step_m != 0)]
+    step = np.diff(t_s[order]) if has_times else abs(step_m)
+    courses = step_m[(step <= _MAX_PASS_STEPS * np.median(step)) & (step_m != 0)]
     if len(courses) < _MIN_COURSES:
         return None
     mean = np.mean(courses / np.abs(courses))
