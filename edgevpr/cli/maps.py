@@ -248,7 +248,8 @@ def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, fl
     lens = read_camera_lens(shared.make_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
         places = list(place_map.read_places())
-        pictures = make_map_album(args.map_images, places)
+        upright = place_map.spec.parameters.get("camera") != "nadir"
+        pictures = make_map_album(args.map_images, places, upright=upright)
         queried = places[:: -(-len(places) // MAX_QUERIES) or 1] if pictures else []
         queries = (
             (place.place_id, picture.image, picture.mask)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 _NAME_COLUMNS = 17  # keeps a row at about 120 columns
 _REASON_COLUMNS = 48
 _MIN_OFFSETS = 5
+_NEARLY_ALL = 0.9
 _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 
 
@@ -108,18 +109,19 @@ def _summarise(matches: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]
     offsets_m = [complex(*match["gps_tag_offset_m"]) for match in fixes if match["gps_tag_offset_m"]]
     if offset_m := _find_common_offset(offsets_m, in_world_m):
         yield (
-            f"the fixes lie {format_offset(offset_m.real, offset_m.imag)} of the GPS tags, nearly all alike: if the "
-            "tags are right, the map is displaced. A flight with GPS measures this; then run edgevpr map move"
+            f"the fixes lie {format_offset(offset_m.real, offset_m.imag)} of the GPS tags, nearly all alike: map or "
+            "tags are displaced (or the camera is tilted). A flight with GPS measures it: see edgevpr map move"
         )
     if of_place := sum(match["position"]["of_place"] for match in fixes):
         yield f"*: {of_place} positions are simply those of the matched places: the offset from the place is unknown"
 
 
 def _find_common_offset(offsets_m: Sequence[complex], claimed_m: float) -> complex | None:
-    """Return the median offset (east + north j) if it is larger than `claimed_m` and the scatter of the offsets allow;
-    None if it is not, or there are too few."""
+    """Return the median offset (east + north j) if it is larger than `claimed_m` and the scatter of nearly all offsets
+    allow; None if it is not, or there are too few."""
     if len(offsets_m) < _MIN_OFFSETS:
         return None
     middle_m = complex(median(each.real for each in offsets_m), median(each.imag for each in offsets_m))
-    scatter_m = median(abs(each - middle_m) for each in offsets_m)
-    return middle_m if abs(middle_m) > max(2 * claimed_m, 3 * scatter_m) else None
+    distances_m = sorted(abs(each - middle_m) for each in offsets_m)
+    scatter_m = distances_m[math.ceil(_NEARLY_ALL * len(distances_m)) - 1]
+    return middle_m if abs(middle_m) > max(2 * claimed_m, 2 * scatter_m) else None

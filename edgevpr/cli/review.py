@@ -41,7 +41,6 @@ def run_report(args: Namespace) -> None:
 
     flight = read_flight(args.log)
     folder = find_recording(get_text(flight.start, "recording"), args.log)
-    frames = make_album(args.images, list_frames(folder) if folder else {})
     ground: list[Place] = []
     no_ground = "The log does not name a map: pass one with --map."
     if path := args.map or get_text(flight.start, "map"):
@@ -51,7 +50,9 @@ def run_report(args: Namespace) -> None:
             if args.map:
                 raise
             no_ground = f"The map of the flight is not drawn: {error} If it has moved, pass its path with --map."
-    references = make_map_album(args.map_images, ground)
+    upright = not any(place.pose for place in ground)  # only maps of a camera that looks down have poses
+    frames = make_album(args.images, list_frames(folder) if folder else {}, upright=upright)
+    references = make_map_album(args.map_images, ground, upright=upright)
     page = make_flight_page(flight, ground, frames, references, no_ground)
     write_output(args.out, args.log, page)
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")

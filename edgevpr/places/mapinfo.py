@@ -61,8 +61,8 @@ class MapInfo:
     def one_way_warning(self) -> str:
         """A one-sentence warning about the error that a map flown in one direction cannot reveal."""
         return (
-            f"all places were mapped on a course of about {self.one_way_deg:.0f} degrees: if the camera triggers late, "
-            "all positions are shifted by its delay times the speed; only lines in the opposite direction reveal this"
+            f"all places seem to be mapped on a course of about {self.one_way_deg:.0f} degrees: if the camera triggers "
+            "late, all positions are shifted by its delay times the speed; only lines flown the other way show this"
         )
 
 
@@ -93,23 +93,25 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
 
 def _find_one_way_deg(place_map: PlaceMap) -> float | None:
     """Return the course over ground, degrees, if all places were mapped in roughly one direction; None if not, or if
-    they are cut from an orthophoto. Places without times count as mapped in the order of the map."""
+    they are cut from an orthophoto. If too few have times, the order of the map counts."""
     tags: list[tuple[float, float, float]] = []
     with suppress(PlaceError):  # the places before a damaged one are enough
         for place in place_map.read_places():
             if place.position and not (place.pose and place.pose.is_surveyed):
                 t_s = math.nan if place.t_utc_s is None else place.t_utc_s
                 tags.append((t_s, place.position.lat_deg, place.position.lon_deg))
+    timed = sorted(tag for tag in tags if not math.isnan(tag[0]))
+    has_times = len(timed) > _MIN_COURSES
     if len(tags) <= _MIN_COURSES:
         return None
-    t_s, lat_deg, lon_deg = np.array(tags).T
-    has_times = not np.isnan(t_s).any()
-    order = np.argsort(t_s, kind="stable") if has_times else np.arange(len(tags))
-    lat_deg, lon_deg = lat_deg[order], lon_deg[order]
+    t_s, lat_deg, lon_deg = np.array(timed if has_times else tags).T
     east_m, north_m = offset_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
     step_m = east_m + 1j * north_m
-    step = np.diff(t_s[order]) if has_times else abs(step_m)
-    courses = step_m[(step <= _MAX_PASS_STEPS * np.median(step)) & (step_m != 0)]
+    step = np.diff(t_s) if has_times else abs(step_m)
+    step, step_m = step[step_m != 0], step_m[step_m != 0]
+    if len(step) < _MIN_COURSES:
+        return None
+    courses = step_m[step <= _MAX_PASS_STEPS * np.median(step)]
     if len(courses) < _MIN_COURSES:
         return None
     mean = np.mean(courses / np.abs(courses))

@@ -175,14 +175,12 @@ def make_album(
     return Album(*finders)
 
 
-def make_map_album(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
+def make_map_album(sources: Sequence[str | Path], places: Sequence[Place], *, upright: bool) -> Album:
     """Return the album of a map's pictures. `sources`: folders of pictures, a video, or the orthophoto from which the
-    map was cut. Raises EdgevprError for a source that cannot be used."""
+    map was cut. `upright`: see `read_image`. Raises EdgevprError for a source that cannot be used."""
     if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
         return Album(_open_orthophoto(sources[0], places))
-    return make_album(
-        sources, upright=not any(place.pose for place in places)
-    )  # only a camera that looks down has poses
+    return make_album(sources, upright=upright)
 
 
 def embed_pictures(

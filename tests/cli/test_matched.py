@@ -24,8 +24,13 @@ def make_matches(offsets_m):
 def test_format_matches_reports_fixes_that_all_lie_off_their_tags_alike(east_m, scatter_m, count, is_reported):
     offsets_m = np.random.default_rng(3).normal((east_m, -5.0), scatter_m, (count, 2))
     said = "\n".join(format_matches(make_matches(offsets_m)))
-    assert ("the map is displaced" in said) == is_reported
+    assert ("map or tags are displaced" in said) == is_reported
     assert ("m east and" in said) == is_reported
+
+
+@pytest.mark.parametrize("others", [[(0, 0)] * 4, [(-300, 0)] * 7])
+def test_format_matches_reports_no_offset_that_many_do_not_have(others):
+    assert "displaced" not in "\n".join(format_matches(make_matches([*[(40, 0)] * 8, *others])))
 
 
 def test_format_matches_needs_no_tags():

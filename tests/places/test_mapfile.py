@@ -273,17 +273,19 @@ def test_read_identity_is_equal_for_a_copy_until_a_change(map_path, tmp_path, ch
     ("courses_deg", "one_way_deg"),
     [([90.0] * 4, 90.0), ([90.0, 270.0] * 2, None), ([0.0, 90.0, 180.0, 270.0], None), ([80.0, 100.0] * 2, 90.0)],
 )
-@pytest.mark.parametrize("has_times", [True, False])
-def test_describe_map_reports_the_course_of_a_map_flown_in_one_direction(tmp_path, courses_deg, one_way_deg, has_times):
+@pytest.mark.parametrize(("has_times", "repeats"), [(True, 1), (False, 1), (False, 3)])
+def test_describe_map_reports_the_course_of_a_map_flown_in_one_direction(
+    tmp_path, courses_deg, one_way_deg, has_times, repeats
+):
     spec = dataclasses.replace(SPEC, parameters={"camera": "nadir"})
     with PlaceMap.create(tmp_path / "map.gpkg", spec) as place_map:
         for line, course_deg in enumerate(courses_deg):
-            for nth in range(8):
-                step_m = 20.0 * nth * np.exp(1j * math.radians(90.0 - course_deg)) + 40j * line
+            for nth in range(8 * repeats):
+                step_m = 20.0 * (nth // repeats) * np.exp(1j * math.radians(90.0 - course_deg)) + 40j * line
                 lat_deg, lon_deg = offset_position(50.0, 8.0, step_m.real, step_m.imag)
-                # The way back to the next line is flown without pictures.
-                taken_s = 1.7e9 + 60.0 * line + nth if has_times else None
-                added = dataclasses.replace(frame(8 * line + nth), position=Position(lat_deg, lon_deg), t_utc_s=taken_s)
-                place_map.add(added, make_descriptor(nth))
+                # The way back to the next line is flown without pictures. The first picture has no time.
+                taken_s = 1.7e9 + 60.0 * line + nth if has_times and (line, nth) > (0, 0) else None
+                added = dataclasses.replace(frame(nth), position=Position(lat_deg, lon_deg), t_utc_s=taken_s)
+                place_map.add(dataclasses.replace(added, name=f"{line}-{nth}"), make_descriptor(nth % 8))
         info = describe_map(place_map)
     assert info.one_way_deg == (None if one_way_deg is None else pytest.approx(one_way_deg, abs=1.0))

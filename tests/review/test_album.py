@@ -30,24 +30,25 @@ def test_align_picture_returns_the_image_in_the_orientation_of_the_pose(tmp_path
     assert album.align_picture(replace(turned, source_image="gone.png"), LENS) is None
 
 
-@pytest.mark.parametrize(("pose", "is_turned"), [(None, True), (POSE, False)], ids=["ahead", "down"])
-def test_make_map_album_turns_only_images_of_a_camera_that_looks_ahead(tmp_path, pose, is_turned):
+@pytest.mark.parametrize("upright", [True, False])
+def test_make_map_album_turns_images_only_if_they_are_to_be_upright(tmp_path, upright):
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera's right side is up
     Image.fromarray(np.full((60, 80, 3), 128, np.uint8)).save(tmp_path / "photo.jpg", exif=exif)
-    album = make_map_album([tmp_path], [Place(place_id=1, source_image="photo.jpg", position=HOME, pose=pose)])
-    assert album.find_image("photo.jpg").shape[:2] == ((80, 60) if is_turned else (60, 80))
+    places = [Place(place_id=1, source_image="photo.jpg", position=HOME, pose=POSE)]
+    album = make_map_album([tmp_path], places, upright=upright)
+    assert album.find_image("photo.jpg").shape[:2] == ((80, 60) if upright else (60, 80))
 
 
 def test_make_map_album_cuts_the_pictures_of_an_orthophoto_again(tmp_path):
     pytest.importorskip("rasterio")
     pose = replace(POSE, is_surveyed=True)
     places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
-    album = make_map_album([write_textured_raster(tmp_path / "town.tif")], places)
+    album = make_map_album([write_textured_raster(tmp_path / "town.tif")], places, upright=False)
     assert album.find_image("town.tif_r000_c000").std() > 10
     assert album.find_image("town.tif_r000_c001") is None
     assert album.align_picture(places[0], None).image.std() > 10
-    assert make_map_album([], places).find_image("town.tif_r000_c000") is None
+    assert make_map_album([], places, upright=False).find_image("town.tif_r000_c000") is None
 
 
 def test_embed_pictures_shrinks_images_and_then_drops_some(tmp_path):

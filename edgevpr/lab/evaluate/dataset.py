@@ -9,11 +9,11 @@ published data sets by their files:
 """
 
 import csv
+import hashlib
 import io
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from filecmp import cmp
 from pathlib import Path
 
 import numpy as np
@@ -84,12 +84,21 @@ def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth,
     return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries), copied)
 
 
-def _count_copies(paths: Iterable[Path], references: Iterable[Path]) -> int:
-    """Return the number of `paths` whose file has the same content as one of `references`."""
-    by_size: dict[int, list[Path]] = {}
-    for reference in references:
-        by_size.setdefault(reference.stat().st_size, []).append(reference)
-    return sum(any(cmp(path, other, shallow=False) for other in by_size.get(path.stat().st_size, [])) for path in paths)
+def _count_copies(queries: Iterable[Path], references: Sequence[Path]) -> int:
+    """Return the number of `queries` whose file has the same content as one of `references`."""
+    sizes = {path.stat().st_size for path in references}
+    candidates = [path for path in queries if path.stat().st_size in sizes]
+    sizes = {path.stat().st_size for path in candidates}
+    digests = {_compute_digest(path) for path in references if path.stat().st_size in sizes} - {None}
+    return sum(_compute_digest(path) in digests for path in candidates)
+
+
+def _compute_digest(path: Path) -> bytes | None:
+    """Return the SHA-256 of a file; None if it is unreadable, which is reported when its image is needed."""
+    try:
+        return hashlib.sha256(path.read_bytes()).digest()
+    except OSError:
+        return None
 
 
 def list_names(folder: str | Path) -> tuple[str, ...]:

@@ -104,7 +104,7 @@ def _list_notes(results: Sequence[TechniqueResult]) -> Iterator[str]:
     if first.unscored:
         yield f"{first.unscored} more queries have no ground truth and are not scored."
     if first.queries_copied:
-        yield f"{first.queries_copied} of them are also references (the same file): they test nothing; leave them out."
+        yield f"{first.queries_copied} of the queries are also references (the same file): leave them out."
     yield from ABOUT_FIGURES
     for result in results:
         if result.sequence > 1:

@@ -95,7 +95,8 @@ class Navigator(Listener):
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
         self._height_ratio, self._height_ratio_sd, self._resolved_doubt_m = 1.0, 0.0, 0.0
-        self._shared_sd_m = map_sd_m  # standard deviation of the error common to the last fixes
+        # Standard deviation of the error common to the last fixes, and its part that is due to a tilt of the camera.
+        self._shared_sd_m, self._common_tilt_m = map_sd_m, 0.0
 
     @property
     def has_gps(self) -> bool:
@@ -204,7 +205,8 @@ class Navigator(Listener):
         if verdict.reason:
             return Advice(None, verdict.reason, is_held=True)
         self._navigation.correct_by_fix(predicted, verdict)
-        self._shared_sd_m = math.hypot(self._map_sd_m, time_error_m, located.common_tilt_m if located else 0.0)
+        self._common_tilt_m = located.common_tilt_m if located else 0.0
+        self._shared_sd_m = math.hypot(self._map_sd_m, time_error_m, self._common_tilt_m)
         if match.attitude_error:
             self._attitude_error_s = match.t_s
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)
@@ -310,7 +312,7 @@ class Navigator(Listener):
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.estimate_state(t_s)
         max_error_m = _MAX_CONTINUOUS_ERROR_M if self._channel.is_continuous else _MAX_ERROR_M
-        if estimate is None or estimate.accuracy_m > max_error_m:
+        if estimate is None or max(estimate.accuracy_m, self._common_tilt_m) > max_error_m:
             return None
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
@@ -339,8 +341,9 @@ class Navigator(Listener):
         autopilot_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
         error_m = float(distance_m(*autopilot_deg, position.lat_deg, position.lon_deg))
         # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by error_m**2.
-        if error_m**2 <= 2 * estimate.accuracy_m**2:
-            figures = {"distance_m": error_m, "accuracy_m": estimate.accuracy_m}
+        accuracy_m = max(estimate.accuracy_m, self._common_tilt_m)
+        if error_m**2 <= 2 * accuracy_m**2:
+            figures = {"distance_m": error_m, "accuracy_m": accuracy_m}
             return Advice(None, Reason(ReasonCode.NOT_BETTER, figures))
         # Lead by the drift of half the time to the next fix, so that the autopilot is correct halfway. Now it
         # is wrong by this lead, in one direction: half of its square is added to the variance of each axis.

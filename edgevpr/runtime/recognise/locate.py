@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from edgevpr.core.arrays import Covariance, Doubles
+from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, move_position, offset_between_m, picture_axes
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Candidate, Place, Position
@@ -32,7 +33,7 @@ _LANDMARK_SD = 0.008
 _POSE_SD = 0.03
 _RECORDED_POSE_SD = 0.2
 _MEAN_VARIANCE_RATIO = 0.25  # variance of the mean of the votes, relative to that of a single vote
-_MIN_BASELINE = 0.1  # of the longest side: nearer places do not show the scale
+_MIN_BASELINE = 0.2  # of the longest side: nearer places do not show the scale
 _MIN_SCORE_RATIO = 0.5  # matches with at least this fraction of the best score are also used
 _MAX_DIFFERENCE_SD = 4.0  # places whose positions differ by more are not used
 _MAX_POSITION_SPREAD = 0.2  # fraction of the footprint: if positions are farther apart, one of the places is wrong
@@ -106,23 +107,31 @@ def measure_distance_m(places: Sequence[Candidate], cells: int | None) -> float:
     """Return the distance from the image centre of the first of the matched `places` to that of the query, without
     poses: if several show the same ground, their positions give the scale. 0.0 if it is unknown. `cells` is as in
     `locate`."""
-    centres, positions = [], []
-    for candidate in places:
-        match, position = candidate.match, candidate.place.position
-        if cells is None or match.shift_cells is None or match.rotation_deg is None or position is None:
-            continue
-        if match.score < _MIN_SCORE_RATIO * places[0].match.score:
-            continue
-        # Centre of the place's image in that of the query, right + down j, in longest sides.
-        turn_scale = cmath.rect(match.height_ratio or 1.0, math.radians(match.rotation_deg))
-        centres.append(-complex(*match.shift_cells) / cells / turn_scale)
-        positions.append(position)
+    nearest = _find_centre(places[0].match, cells)
+    if nearest is None:
+        return 0.0
+    min_score = _MIN_SCORE_RATIO * places[0].match.score
+    known = [
+        (centre, candidate.place.position)
+        for candidate in places
+        if candidate.match.score >= min_score and candidate.place.position
+        if (centre := _find_centre(candidate.match, cells)) is not None
+    ]
     footprints_m = [
         distance_m(one.lat_deg, one.lon_deg, other.lat_deg, other.lon_deg) / abs(first - second)
-        for (first, one), (second, other) in combinations(zip(centres, positions, strict=True), 2)
+        for (first, one), (second, other) in combinations(known, 2)
         if abs(first - second) >= _MIN_BASELINE
     ]
-    return abs(centres[0]) * float(np.median(footprints_m)) if footprints_m else 0.0
+    return abs(nearest) * float(np.median(footprints_m)) if footprints_m else 0.0
+
+
+def _find_centre(match: FineMatch, cells: int | None) -> complex | None:
+    """Return the centre of the image of a matched place in that of the query, right + down j, in longest sides; None if
+    the match has no shift."""
+    if cells is None or match.shift_cells is None or match.rotation_deg is None:
+        return None
+    turn_scale = cmath.rect(match.height_ratio or 1.0, math.radians(match.rotation_deg))
+    return -complex(*match.shift_cells) / cells / turn_scale
 
 
 def locate(

@@ -155,14 +155,14 @@ class CommonTilt:
 
     def add(self, perspective: Perspective, view: View, place_id: int) -> None:
         """Add the perspective of an accepted match. A repeat of the previous place is ignored."""
-        if place_id == self._place_id or view.focal is None:
+        if place_id == self._place_id:
             return
-        self._place_id = place_id
+        self._place_id, focal = place_id, view.focal or TYPICAL_FOCAL
         right, down = perspective.over_place[2, :2]
-        tilt = cmath.rect(view.focal, -math.radians(view.rotation_deg)) * complex(right, down)
-        if abs(tilt) > _MAX_TILT:
+        tilt = cmath.rect(focal, -math.radians(view.rotation_deg)) * complex(right, down)
+        if not abs(tilt) <= _MAX_TILT:  # also of a fit that failed (NaN)
             return
-        sd = math.hypot(view.focal * perspective.slope_sd, _SINGLE_TILT_SD, _COMMON_RELATIVE_SD * abs(tilt))
+        sd = math.hypot(focal * perspective.slope_sd, _SINGLE_TILT_SD, _COMMON_RELATIVE_SD * abs(tilt))
         weight = sd**-2
         self._weighted = _DECAY * self._weighted + weight * tilt
         self._weight = _DECAY * self._weight + weight

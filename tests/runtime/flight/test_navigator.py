@@ -9,7 +9,7 @@ import pytest
 from fakes import make_vehicle
 from simulated_flight import HOME, SimFlight, make_match, norms
 
-from edgevpr.core.geodesy import distance_m
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
@@ -227,3 +227,16 @@ def test_positions_of_many_matches_claim_a_tilt_common_to_all(common_tilt_m):
         event = make_match(Position(*HOME), t_s, vehicle, 1.0, (1,))
         navigator.advise(replace(event, located=replace(event.located, common_tilt_m=common_tilt_m)), t_s)
     assert max(1.0, common_tilt_m) <= navigator.accuracy_m(t_s) < common_tilt_m + 2.0
+
+
+@pytest.mark.parametrize(("common_tilt_m", "is_sent"), [(0.0, True), (20.0, True), (80.0, False)])
+def test_a_fix_is_sent_only_if_a_tilt_common_to_all_cannot_explain_its_distance(common_tilt_m, is_sent):
+    navigator, there = Navigator(1.0, 1.0), Position(*offset_position(*HOME, 60.0, 0.0))
+    for t_s in map(float, range(1, 60)):
+        vehicle = make_vehicle(*HOME, t_s, has_gps=False, position_sd_m=30.0, velocity_m_s=(0.0, 0.0))
+        navigator.handle_vehicle(vehicle)
+        event = make_match(there, t_s, vehicle, max(1.0, common_tilt_m), (1,))
+        event = replace(event, located=replace(event.located, common_tilt_m=common_tilt_m))
+        fix = navigator.advise(event, t_s).fix
+    assert bool(fix) == is_sent
+    assert bool(navigator.make_interim_fix(t_s + 0.5)) == is_sent

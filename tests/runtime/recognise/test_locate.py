@@ -143,14 +143,17 @@ def test_locate_needs_a_pose_and_a_shift():
 
 
 def test_measure_distance_takes_its_scale_from_places_of_the_same_ground():
-    """Above a point 30 m north of the first place and 18 m north of the second, whose image is turned by 90 degrees."""
+    """Above a point 30 m north of the first place and 16 m north of the second, whose image is turned by 90 degrees."""
     first = make_candidate(1, shift=(0, -15))
-    second = make_candidate(2, shift=(9, 0), north_m=12.0, turned_deg=90.0)
+    second = make_candidate(2, shift=(8, 0), north_m=14.0, turned_deg=90.0)
     other = make_candidate(3, shift=(10, 10), east_m=900.0, score=0.1)
     assert measure_distance_m([first, second, other], CELLS) == pytest.approx(30.0, abs=0.01)
-    assert measure_distance_m([second, first], CELLS) == pytest.approx(18.0, abs=0.01)
+    assert measure_distance_m([second, first], CELLS) == pytest.approx(16.0, abs=0.01)
     assert measure_distance_m([first, other], CELLS) == 0.0, "its scale is unknown"
     assert measure_distance_m([first, replace(first, place=second.place)], CELLS) == 0.0, "both at the same shift"
+    unshifted = Candidate(first.place, FineMatch(0.3))
+    assert measure_distance_m([unshifted, first, second], CELLS) == 0.0
+    assert measure_distance_m([first, unshifted, second], CELLS) == pytest.approx(30.0, abs=0.01)
     assert measure_distance_m([first, second], None) == 0.0, "ahead"
 
 

@@ -160,3 +160,11 @@ def test_common_tilt_claims_what_it_cannot_exclude(tilt_deg, count):
 def test_common_tilt_counts_a_place_once():
     assert estimate_common_tilt(0.15, 0, place_ids=[7] * 6).mean == estimate_common_tilt(0.15, 0, count=1).mean
     assert CommonTilt().sd > 0
+
+
+@pytest.mark.parametrize("focal", [None, 0.8])
+def test_common_tilt_is_learnt_with_and_without_a_lens(focal):
+    common = CommonTilt()
+    for place_id in range(12):
+        common.add(Perspective(np.eye(3), slope_sd=0.1, regions=40), replace(SEEN, focal=focal), place_id)
+    assert common.sd < CommonTilt().sd / 4
