@@ -117,6 +117,7 @@ class ReasonCode(Code):
         "held back: far from the predicted position",
         "held back: {distance_m:.0f} m from the predicted position (+-{accuracy_m:.0f} m): another fix must agree",
     )
+    HELD_UNCONFIRMED = "held back: nothing confirms it yet", "held back: the first for a long time: another must agree"
     PAUSED = "not sent: paused by the ground station"
     PARAMETER_DANGEROUS = "not sent: a parameter is dangerous", "not sent: set {changes}. {why}"
     PARAMETERS_UNANSWERED = "not sent: parameters not reported", "not sent: the autopilot has not reported {names}"

@@ -44,13 +44,15 @@ class Heights:
     the ground, disarmed. If the first report arrives in flight, tracking starts from its height above home.
 
     `takeoff_m`: height above the take-off point (None: no report yet). `jumped_m`: sum of altitude jumps since take-off
-    that neither a new home nor a new origin explains; they are not included in the height. `contradiction_m`:
+    that neither a new home nor a new origin explains; they are not included in the height. `stepped_m`: sum of the
+    steps of the height where its source changed, which are differences between sources. `contradiction_m`:
     difference from the range finder, if it has persisted for seconds (None: they agree)."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
         self.takeoff_m: float | None = None
-        self.jumped_m = 0.0
+        self.jumped_m = self.stepped_m = 0.0
+        self._source: tuple[str, float] | None = None  # of the height, and how much higher it is than `takeoff_m`
         self.contradiction_m: float | None = None
         self._last: Altitudes | None = None
         self._is_standing = self._has_home = self._is_guess = self._has_jumped = False
@@ -88,11 +90,23 @@ class Heights:
             self.takeoff_m += self._compute_change_m(self._last, altitudes)
         self._last = altitudes
         self._check_range(altitudes.t_s)
+        self._sum_steps(altitudes.t_s)
 
     def compute_height_m(self, now_s: float) -> float:
         """Return the height above the ground in metres from the best recent source."""
         measured_m = self._get_recent(self._range, now_s, RANGE_MAX_AGE_S)
         return self._compute_autopilot_height_m(now_s) if measured_m is None else measured_m
+
+    def _sum_steps(self, now_s: float) -> None:
+        name = "take-off"
+        if self._get_recent(self._range, now_s, RANGE_MAX_AGE_S) is not None:
+            name = "range finder"
+        elif self._get_recent(self._terrain, now_s, TERRAIN_MAX_AGE_S) is not None:
+            name = "terrain"
+        offset_m = self.compute_height_m(now_s) - (self.takeoff_m or 0.0)
+        if self._source and name != self._source[0]:
+            self.stepped_m += offset_m - self._source[1]
+        self._source = name, offset_m
 
     @property
     def doubt_m(self) -> float:

@@ -155,6 +155,17 @@ def test_height_over_terrain_is_independent_of_home():
     assert vehicle.fly() == approx_height(70.0)
 
 
+def test_steps_of_the_height_at_changes_of_its_source_are_summed():
+    vehicle = Vehicle()
+    vehicle.take_off(30.0)
+    steps_m = [vehicle.autopilot.vehicle.height_step_m]
+    for range_m in (48.0, 40.0, None):  # the ground rises in between
+        vehicle.range_m = range_m
+        vehicle.fly()
+        steps_m.append(vehicle.autopilot.vehicle.height_step_m)
+    assert steps_m == pytest.approx([0.0, 18.0, 18.0, 8.0], abs=0.1)
+
+
 def test_height_contradicted_by_the_range_finder_is_reported_once():
     vehicle = Vehicle()
     vehicle.take_off(30.0)

@@ -30,6 +30,7 @@ _UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
 _MIN_REPORTED_DELAY_S = 0.3
 
 _SOURCE_SET_RETRY_S = 2.0  # between two requests for a source set, until one is answered
+_MIN_FLYING_HEIGHT_M = 5.0
 _MIN_GPS_GOOD_S = 3.0  # GPS must be good for this long before the source set with GPS is requested again
 
 _log = logging.getLogger(__name__)
@@ -206,12 +207,15 @@ class AutopilotOutput:
         Call it once a second."""
         with self._link.take_turn("report"):
             self._link.set_health(health)
-            self._request_source_set(is_paused=health is messages.Health.STANDBY)
-            self._report_output()
+            is_paused = health is messages.Health.STANDBY
+            self._request_source_set(is_paused)
+            self._report_output(Output.PAUSED if is_paused else self._navigator.output)
             now_s, ram_bytes = self._clock.mono_s(), (load.ram_used_bytes, load.ram_total_bytes)
             self._link.send(messages.make_computer_status(now_s, load.core_usage, *ram_bytes, temperature_c))
 
     def _request_source_set(self, is_paused: bool) -> None:
+        """Request another source set if needed. In flight, a set may still be in use that was requested before edgevpr
+        was restarted."""
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
         if vehicle is None or not vehicle.is_fresh(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
@@ -222,6 +226,7 @@ class AutopilotOutput:
             has_gps=navigator.has_gps or vehicle.gps_is_silent,
             has_receiver=vehicle.gps is not None and vehicle.gps.steady_for_s >= _MIN_GPS_GOOD_S,
             has_own=is_sent and navigator.knows_position(now_s),
+            is_flying=vehicle.height_m is not None and vehicle.height_m > _MIN_FLYING_HEIGHT_M,
             answered_s=stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf),
         )
         if number:
@@ -229,9 +234,8 @@ class AutopilotOutput:
             self._notifier.announce(Severity.WARNING, text, topic="sources")
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
-    def _report_output(self) -> None:
+    def _report_output(self, output: Output) -> None:
         """Report a change in what a continuous channel sends."""
-        output = self._navigator.output
         if self._link.channel.is_continuous and output is not self._output:
             self._output = output
             self._notifier.log("output", state=output.name)
@@ -264,11 +268,13 @@ class AutopilotOutput:
 class SourceSets:
     """Decides which source set to request from the autopilot: `no_gps` when GPS is lost or wrong and we send positions,
     then `gps` once GPS has been good for three seconds, or we have sent none for as long beside a steady receiver that
-    the map contradicts. Each is requested until it is answered. Unless both numbers are configured, none is."""
+    the map contradicts. If the first call is in flight, `gps` is requested without `no_gps` before. Each is requested
+    until it is answered. Unless both numbers are configured, none is."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
         self._requested: int | None = None
+        self._may_differ: bool | None = None  # the autopilot may use another set than `gps`; None: no call yet
         self._requested_s = math.inf
         self._bad_s = -math.inf  # when GPS was last not good
         self._alternative_s = -math.inf  # when there was last something other than a receiver that the map contradicts
@@ -279,22 +285,24 @@ class SourceSets:
         return self._with_gps is not None and self._without is not None
 
     def choose_set(
-        self, now_s: float, *, has_gps: bool, has_receiver: bool, has_own: bool, answered_s: float
+        self, now_s: float, *, has_gps: bool, has_receiver: bool, has_own: bool, answered_s: float, is_flying: bool
     ) -> int | None:
         """Return the number of the set to request now (None: no request). `has_gps`: there is a trusted GPS;
         `has_receiver`: a receiver is steady, trusted or not; `has_own`: positions are sent; `answered_s`: when such a
-        request was last answered."""
+        request was last answered; `is_flying`: the vehicle is in the air."""
+        if self._may_differ is None:
+            self._may_differ, self._bad_s = is_flying, now_s
         if not has_gps:
             self._bad_s = now_s
         if has_own or not has_receiver:
             self._alternative_s = now_s
         number = self._without if not has_gps and has_own else None
-        if self._requested is not None and now_s - min(self._bad_s, self._alternative_s) > _MIN_GPS_GOOD_S:
+        if self._may_differ and now_s - min(self._bad_s, self._alternative_s) > _MIN_GPS_GOOD_S:
             number = self._with_gps
         is_alive = answered_s >= self._requested_s or now_s - self._requested_s < _SOURCE_SET_RETRY_S
         if number is None or (number == self._requested and is_alive):
             return None
-        self._requested, self._requested_s = number, now_s
+        self._requested, self._requested_s, self._may_differ = number, now_s, True
         return number
 
 

@@ -7,6 +7,7 @@ from collections import deque
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
+from edgevpr.runtime.flight.measurements import MIN_HEIGHT_M
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -15,7 +16,6 @@ MIN_CORRECTION_RATIO = 1.1  # a larger error is corrected; five matches scatter 
 MATCHES_IN_A_ROW = 5
 _NEWEST_MATCHES = 3  # over rising or falling ground the median of all five would be two matches old
 _GROUND_CHANGE = 0.3  # further change of rising or falling ground between matches, as a fraction of the height
-MIN_HEIGHT_M = 1.0  # lower heights, as on the ground, are raised to this before comparing
 
 
 class HeightWatch:

@@ -22,6 +22,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 ATTITUDE_SD = math.tan(math.radians(0.5))
 RECEIVER_LAG_SD_S = 0.1  # standard deviation of a receiver's lag, whose mean is `receivers.RECEIVER_LAG_S`
 _UNKNOWN_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
+MIN_HEIGHT_M = 1.0  # lower heights, as on the ground or below the take-off point, are raised to this
 _UNKNOWN_SPEED_M_S = 15.0  # assumed if the aircraft reports none
 _CORRELATION_LENGTH = 0.25  # of the footprint: closer fixes have common errors due to changed ground
 _MAX_HEADING_CHANGE_DEG = 45.0  # largest change of the compass error between two fixes
@@ -92,7 +93,9 @@ def measure_frame(
         return None
     height_m, has_attitude, sd_m = 0.0, False, 0.0
     if vehicle:
-        height_m, has_attitude = height_ratio * (vehicle.height_m or 0.0), vehicle.roll_deg is not None
+        height_m, has_attitude = 0.0, vehicle.roll_deg is not None
+        if vehicle.height_m is not None:
+            height_m = height_ratio * max(MIN_HEIGHT_M, vehicle.height_m)
         sweep_m_s = height_m * math.radians(0.0 if is_level else vehicle.tilt_rate_deg_s)
         attitude_sd = ATTITUDE_SD if has_attitude else _UNKNOWN_ATTITUDE_SD
         sd_m = compute_picture_error_m(vehicle, height_m, event.frame.t_sd_s, attitude_sd, sweep_m_s)

@@ -46,6 +46,9 @@ _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
 # Odometry is corrected if its scale differs by more from the height of one match, or from the median of three.
 _MATCH_SCALE_TOLERANCE = 0.15
+# Two fixes that nothing predicts confirm each other if they are at most so far apart, and an aircraft could fly there.
+_MAX_UNCONFIRMED_S = 30.0
+_MAX_SPEED_M_S = 30.0
 _SCALE_TOLERANCE = 0.02
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them carry the information of one, so the claimed error is multiplied by this. Without it, they outweighed
@@ -94,7 +97,9 @@ class Navigator(Listener):
         self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
-        self._height_ratio, self._height_ratio_sd, self._resolved_doubt_m = 1.0, 0.0, 0.0
+        self._unconfirmed: Fix | None = None  # the last fix that nothing predicted
+        self._height_ratio, self._height_ratio_sd = 1.0, 0.0
+        self._resolved_doubt_m = self._resolved_step_m = 0.0  # differences of height that matches have resolved
         # Standard deviation of the error common to the last fixes, and its part that is due to a tilt of the camera.
         self._shared_sd_m, self._common_tilt_m = map_sd_m, 0.0
 
@@ -123,7 +128,9 @@ class Navigator(Listener):
         if ratio != 1.0:
             self._navigation.restart_odometry_scale(ratio - 1.0, _SCALE_TOLERANCE)
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
-        self._resolved_doubt_m = self._vehicle.height_doubt_m if self._vehicle else 0.0
+        if self._vehicle:
+            self._resolved_doubt_m = self._vehicle.height_doubt_m
+            self._resolved_step_m = self._vehicle.height_step_m
 
     def handle_channel(self, channel: Channel) -> None:
         """Set the channel through which positions are sent. With a continuous one, the autopilot's velocity comes from
@@ -191,20 +198,19 @@ class Navigator(Listener):
             return self._advise_without_report(fix, now_s)
         if vehicle.velocity_m_s is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
-        reported, located = event.vehicle or vehicle, event.located
-        if located and located.height_m and reported.height_m and reported.height_m > 0:
-            error = located.height_m / reported.height_m - 1.0
-            self._navigation.restart_odometry_scale(error, _MATCH_SCALE_TOLERANCE)
         predicted = self._navigation.predict_fix(match)
         if predicted is None:
             if self._navigation.path_velocity_m_s is not None:  # the frame is older than the path: nothing to compare
                 return _withhold(ReasonCode.CONTINUOUS if self._channel.is_continuous else ReasonCode.NO_TELEMETRY)
             self._navigation.start_at_fix(match)
-            return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
+            self._correct_scale(event, vehicle)
+            return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else self._confirm(fix)
         verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
         if verdict.reason:
             return Advice(None, verdict.reason, is_held=True)
         self._navigation.correct_by_fix(predicted, verdict)
+        self._correct_scale(event, vehicle)
+        located = event.located
         self._common_tilt_m = located.common_tilt_m if located else 0.0
         self._shared_sd_m = math.hypot(self._map_sd_m, time_error_m, self._common_tilt_m)
         if match.attitude_error:
@@ -232,7 +238,8 @@ class Navigator(Listener):
     def accuracy_m(self, now_s: float) -> float | None:
         """Return the accuracy of the position: metres, standard deviation of one axis (None: position unknown)."""
         estimate = self._navigation.estimate_state(now_s)
-        return None if estimate is None else self._compute_claimed_m(estimate)
+        is_known = estimate is not None and self._navigation.is_confirmed
+        return self._compute_claimed_m(estimate) if estimate and is_known else None
 
     def estimate_state(self, t_s: float) -> MotionState | None:
         """Return position and motion at `t_s` for a continuous channel; None if they are not accurate enough. `t_s`
@@ -301,11 +308,30 @@ class Navigator(Listener):
         has_none = now_s - self._no_position_s <= _REPORT_TIMEOUT_S < now_s - since_s
         return Advice(fix) if has_none and not self._channel.is_continuous else _withhold(ReasonCode.NO_TELEMETRY)
 
+    def _confirm(self, fix: Fix) -> Advice:
+        """Advise on a fix that nothing predicts: it is held back until another agrees, within what can be flown."""
+        before, self._unconfirmed = self._unconfirmed, fix
+        if before is None or not 0 < fix.t_frame_s - before.t_frame_s <= _MAX_UNCONFIRMED_S:
+            return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
+        reach_m = _MAX_SPEED_M_S * (fix.t_frame_s - before.t_frame_s) + 3 * math.hypot(
+            fix.accuracy_m, before.accuracy_m
+        )
+        if distance_m(before.lat_deg, before.lon_deg, fix.lat_deg, fix.lon_deg) > reach_m:
+            return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
+        return Advice(fix)
+
+    def _correct_scale(self, event: Recognition, vehicle: Vehicle) -> None:
+        """Correct the scale of odometry by the height that the accepted match of an event shows."""
+        located, reported_m = event.located, (event.vehicle or vehicle).height_m
+        if located and located.height_m and reported_m and reported_m > 0:
+            self._navigation.restart_odometry_scale(located.height_m / reported_m - 1.0, _MATCH_SCALE_TOLERANCE)
+
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
         ratio, ratio_sd = self._height_ratio, self._height_ratio_sd
         if vehicle and vehicle.height_m and vehicle.height_m > 0:
-            doubt_m = max(0.0, vehicle.height_doubt_m - self._resolved_doubt_m)
+            step_m = abs(vehicle.height_step_m - self._resolved_step_m)
+            doubt_m = max(vehicle.height_doubt_m - self._resolved_doubt_m, step_m)
             ratio_sd = math.hypot(ratio_sd, doubt_m / vehicle.height_m)
         return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_ratio_sd=ratio_sd)
 
@@ -335,6 +361,8 @@ class Navigator(Listener):
         estimate = self._navigation.estimate_state(now_s)
         if estimate is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
+        if not self._navigation.is_confirmed:
+            return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
         position, claimed_m = estimate.position, self._compute_claimed_m(estimate)
         east_m_s, north_m_s = velocity_m_s
         age_s = now_s - vehicle.t_received_s

@@ -34,6 +34,7 @@ class Output(Enum):
     LEADS_AWAY = Severity.WARNING, "autopilot drifts off GPS: nothing sent"
     REFUSED = Severity.WARNING, "autopilot refuses positions: not sent"
     LINK_SHARED = Severity.WARNING, "two autopilots on link: nothing sent"
+    PAUSED = Severity.INFO, "paused: no positions are sent"
 
     @property
     def is_sent(self) -> bool:

@@ -257,6 +257,35 @@ def test_frame_claims_a_contradiction_of_height_sources_until_a_match_shows_the_
     assert [frame.scale_sd for frame, _ in navigator._navigation.frames] == pytest.approx([0.3, 0.0, 0.2, 0.0])
 
 
+def test_frame_claims_a_step_of_the_height_to_another_source_since_a_match_showed_the_height():
+    navigator = navigate()
+    for step_m in (-30.0, 10.0, 10.0):
+        event = fake_match(vehicle=make_vehicle(*HOME, NOW_S, height_m=100.0, height_step_m=step_m))
+        navigator.handle_vehicle(event.vehicle)
+        navigator.handle_frame(event)
+        navigator.correct_height(1.0)
+    assert [frame.scale_sd for frame, _ in navigator._navigation.frames] == pytest.approx([0.3, 0.4, 0.0])
+
+
+def test_frame_below_the_takeoff_point_has_the_height_that_matches_show():
+    navigator = navigate()
+    navigator.correct_height(60.0)
+    view = LevelledImage(np.zeros((8, 8), np.uint8), None, View(nadir_offset=(0.1, 0.0)))
+    reports = {"height_m": -60.0, "roll_deg": 0.0, "pitch_deg": 0.0, "velocity_m_s": (0.0, 0.0)}
+    navigator.handle_frame(fake_match(vehicle=make_vehicle(*HOME, NOW_S, **reports), picture=view))
+    assert navigator._navigation.frames[0][0].attitude_gain_s2 == pytest.approx(60.0 / 9.81, rel=0.01)
+
+
+@pytest.mark.parametrize(("contradicts_m", "errors"), [(500.0, []), (0.0, [0.4])])
+def test_only_an_accepted_match_corrects_the_scale_of_odometry(contradicts_m, errors):
+    navigator, found = navigate(), []
+    navigator._navigation.contradicts_m = contradicts_m
+    navigator._navigation.restart_odometry_scale = lambda error, tolerance: found.append(error)
+    event = fake_match(vehicle=make_vehicle(*HOME, NOW_S, height_m=100.0))
+    navigator.advise(replace(event, located=replace(event.located, height_m=140.0)), NOW_S)
+    assert found == pytest.approx(errors)
+
+
 CONTINUOUS = Channel.GPS_INPUT
 TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
 
@@ -271,7 +300,7 @@ TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(Reas
         (CONTINUOUS, {"velocity_m_s": None}, {}, 0.0, ReasonCode.NO_TELEMETRY),
         (Channel.COMMAND, {"velocity_m_s": None}, {}, 0.0, ReasonCode.NO_TELEMETRY),
         (CONTINUOUS, {}, {}, None, ReasonCode.CONTINUOUS),
-        (Channel.COMMAND, {}, {}, None, None),
+        (Channel.COMMAND, {}, {}, None, ReasonCode.HELD_UNCONFIRMED),
         (Channel.COMMAND, {}, {}, 500.0, ReasonCode.HELD_OFF_PATH),
         (Channel.COMMAND, {}, {}, 0.0, ReasonCode.NOT_BETTER),
         (CONTINUOUS, {}, {}, 0.0, ReasonCode.CONTINUOUS),
@@ -282,10 +311,31 @@ def test_match_is_sent_only_if_allowed(channel, reports, event, contradicts_m, c
     navigator._navigation.contradicts_m = contradicts_m
     advice = navigator.advise(fake_match(**event), NOW_S)
     assert (advice.why and advice.why.code) is code
-    assert advice.is_held is (code is ReasonCode.HELD_OFF_PATH)
+    assert advice.is_held is (code in (ReasonCode.HELD_OFF_PATH, ReasonCode.HELD_UNCONFIRMED))
     assert len(navigator._navigation.begun) == (contradicts_m is None)
-    if code is None:
-        assert (advice.fix.accuracy_m, advice.fix.t_frame_s) == (1.5, NOW_S)
+
+
+@pytest.mark.parametrize(
+    ("later_s", "off_m", "is_sent"), [(1.0, 20.0, True), (1.0, 60.0, False), (10.0, 60.0, True), (31.0, 0.0, False)]
+)
+def test_match_that_nothing_predicts_is_sent_if_it_confirms_another(later_s, off_m, is_sent):
+    navigator = navigate()
+    navigator._navigation.contradicts_m = None
+    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.HELD_UNCONFIRMED
+    navigator.handle_vehicle(replace(navigator._vehicle, t_received_s=NOW_S + later_s))
+    event, there = fake_match(), Position(*offset_position(*HOME, off_m, 0.0))
+    frame, located = replace(event.frame, t_mono_s=NOW_S + later_s), replace(event.located, position=there)
+    fix = navigator.advise(replace(event, frame=frame, located=located), NOW_S + later_s).fix
+    assert (fix and (fix.accuracy_m, fix.t_frame_s)) == ((1.5, NOW_S + later_s) if is_sent else None)
+
+
+def test_match_that_agrees_with_a_rough_prediction_is_sent_if_another_confirms_it():
+    navigator = navigate(off_m=(10.0, 0.0))
+    navigator._navigation.is_confirmed = False
+    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.HELD_UNCONFIRMED
+    assert navigator.accuracy_m(NOW_S) is None, "it is not shown either"
+    navigator._navigation.is_confirmed = True
+    assert navigator.advise(fake_match(), NOW_S).fix
 
 
 def test_accuracy_of_a_fix_contains_the_error_of_its_time():

@@ -201,6 +201,23 @@ def test_restart_without_gps_sends_from_the_second_match(parameters, late_s):
     assert flight.fly(20).worst_m(flight.now_s - 20)[1] < 8, "the first position has the velocity of two matches"
 
 
+@pytest.mark.parametrize("restarts", [True, False], ids=["restart", "long silence"])
+def test_a_plane_gets_no_fix_of_a_single_match_that_nothing_confirms(restarts):
+    """Neither is a look-alike 500 m away contradicted by dead reckoning, nor at all after a restart."""
+    flight = ClosedLoop("arduplane", velocity_m_s=15j).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(5)
+    flight.matches = flight.sees_motion = False
+    flight.fly(5 if restarts else 60)
+    if restarts:
+        flight.start().fly(5)
+    flight.map_off_m, flight.matches = 500.0, True
+    flight.fly(1).matches = False
+    assert not flight.fly(4).positions_sent(flight.now_s - 5)
+    flight.map_off_m, flight.matches = 0.0, True
+    assert flight.fly(5).positions_sent(flight.now_s - 5)
+    assert flight.error_m[-1] < 10
+
+
 @pytest.mark.parametrize(("map_off_m", "parameters"), [(8, SENSOR), (20, VISION)])
 def test_px4_uses_gps_again_after_a_test_without_gps(map_off_m, parameters):
     def suspend_gps(flight):

@@ -55,15 +55,15 @@ class AnsweringFlight(SimFlight):
 
 def test_source_sets_request_the_set_without_gps_once_and_the_other_after_three_seconds_of_gps():
     flown = AnsweringFlight(**SETS).fly(5)
-    assert flown.numbers == []
+    assert flown.numbers == [1], "it starts in flight, where another may be in use"
     lost_s = flown.t_s
     flown.lose_gps()
-    assert flown.fly(20).numbers == [2]
-    assert flown.asked[0][0] < lost_s + 6
+    assert flown.fly(20).numbers == [1, 2]
+    assert flown.asked[1][0] < lost_s + 6
     found_s = flown.t_s
     flown.find_gps()
-    assert flown.fly(20).numbers == [2, 1]
-    assert 3 <= flown.asked[1][0] - found_s <= 5
+    assert flown.fly(20).numbers == [1, 2, 1]
+    assert 3 <= flown.asked[2][0] - found_s <= 5
 
 
 def test_source_sets_treat_a_wrong_receiver_as_none():
@@ -90,8 +90,17 @@ def test_source_sets_request_nothing_without_both_sets_or_in_a_dry_run(settings)
     assert flown.fly(20).numbers == []
 
 
-def choose(sets, now_s, has_gps, has_own=True, answered_s=NEVER_S, has_receiver=False):
-    return sets.choose_set(now_s, has_gps=has_gps, has_receiver=has_receiver, has_own=has_own, answered_s=answered_s)
+def choose(sets, now_s, has_gps, has_own=True, answered_s=NEVER_S, has_receiver=False, is_flying=False):
+    state = {"has_gps": has_gps, "has_receiver": has_receiver, "has_own": has_own, "is_flying": is_flying}
+    return sets.choose_set(now_s, **state, answered_s=answered_s)
+
+
+@pytest.mark.parametrize("is_flying", [True, False])
+def test_source_sets_request_the_set_with_gps_after_a_start_in_flight(is_flying):
+    sets = SourceSets(BOTH_SETS)
+    asked = [choose(sets, 0.5 * step, step > 4, False, is_flying=is_flying or step > 1) for step in range(20)]
+    assert [0.5 * step for step, number in enumerate(asked) if number] == ([5.5, 7.5, 9.5] if is_flying else [])
+    assert set(asked) - {None} == ({1} if is_flying else set())
 
 
 def test_source_sets_repeat_an_unanswered_request():
