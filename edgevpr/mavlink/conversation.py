@@ -296,16 +296,18 @@ class Conversation:
         if now_s < self._next_request_s:
             return
         self._next_request_s = now_s + REQUEST_INTERVAL_S
-        if self.channel is Channel.VISION and self.autopilot.origin is None:
+        if self.channel in (Channel.VISION, Channel.ODOMETRY) and self.autopilot.origin is None:
             self.send(messages.make_message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
         vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
         is_silent = vehicle is None or now_s - vehicle.t_received_s > REQUEST_INTERVAL_S
         is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
         is_slowed |= is_continuous and now_s - self.autopilot.imu_s > REQUEST_INTERVAL_S
+        if self.autopilot.firmware in messages.FILTER_REPORTS:
+            is_silent |= now_s - self.autopilot.flags_s > REQUEST_INTERVAL_S
         if is_silent or is_slowed or self._has_requested_continuous != is_continuous:
             self._has_requested_continuous = is_continuous
             self.send(*messages.make_report_requests(system_id, self.autopilot.firmware, is_continuous))
-        elif now_s - self.autopilot.receivers.received_s > REQUEST_INTERVAL_S:
+        elif self.autopilot.receivers.is_report_missing(now_s, REQUEST_INTERVAL_S):
             self.send(*messages.make_gps_requests(system_id))
 
     def _reset(self, why: ReasonCode) -> None:

@@ -236,8 +236,8 @@ def make_report_requests(target_system: int, firmware: int, is_continuous: bool 
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
     (511). `firmware`: a MAV_AUTOPILOT. A continuous channel (`is_continuous`) needs more reports, at higher rates."""
     rates_hz = _rates_hz(is_continuous)
-    if firmware in _FILTER_REPORTS:
-        rates_hz[_FILTER_REPORTS[firmware]] = 2
+    if firmware in FILTER_REPORTS:
+        rates_hz[FILTER_REPORTS[firmware]] = 2
     return _make_interval_requests(target_system, rates_hz)
 
 
@@ -339,7 +339,7 @@ _CONTINUOUS_HZ = {
 }
 _UNKNOWN_UINT32 = 2**32 - 1
 # Request only the firmware's own report: ArduPilot sends the pilot a text for each request of an unknown message.
-_FILTER_REPORTS = {
+FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAV_AUTOPILOT_PX4: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
 }

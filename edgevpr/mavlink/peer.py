@@ -167,7 +167,7 @@ class Autopilot:
         self.answered_s: dict[int, float] = {}  # time of its last answer to each of our commands, by number
         self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
-        self._origin_s = self._origin_request_s = self._gps_s = self._flags_s = -math.inf  # times of the last messages
+        self._origin_s = self._origin_request_s = self._gps_s = self.flags_s = -math.inf  # times of the last messages
         self._was_origin_missing, self._flags = False, 0
         self.pressure_alt_m: float | None = None  # barometric altitude in the standard atmosphere
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
@@ -209,7 +209,7 @@ class Autopilot:
             is_armed=self.is_armed,
             has_gps=now_s - self._gps_s <= GPS_TIMEOUT_S,
             lacks_origin=self._is_origin_missing(now_s),
-            flags=self._flags if now_s - self._flags_s <= MAX_FILTER_REPORT_AGE_S else 0,
+            flags=self._flags if now_s - self.flags_s <= MAX_FILTER_REPORT_AGE_S else 0,
             answers_commands=bool(self.answered_s.keys() - {POSITION_FIX}),
         )
 
@@ -286,7 +286,7 @@ class Autopilot:
                 if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
                     self._gps_s = now_s
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
-                self._flags, self._flags_s = message.flags, now_s
+                self._flags, self.flags_s = message.flags, now_s
                 self.accuracy.handle(message, now_s)
                 if not self.accuracy.has_position:
                     self._listener.handle_no_position(now_s)
@@ -315,7 +315,8 @@ class Autopilot:
 
     def _handle_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. If its position is invalid, or 0, 0, `vehicle` becomes None."""
-        gps, lat_deg, lon_deg = self._choose_receiver(now_s), message.lat / 1e7, message.lon / 1e7
+        lat_deg, lon_deg = message.lat / 1e7, message.lon / 1e7
+        gps = self._choose_receiver(now_s, (lat_deg, lon_deg))
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
         # On a continuous channel the estimate may be derived from our positions, so it is no evidence of GPS.
         has_gps = bool(gps) and (is_near or self.selector.choice.channel.is_continuous) and self.px4.uses_gps
@@ -353,9 +354,12 @@ class Autopilot:
         self._vehicles = (*self._vehicles[first:], self.vehicle)
         self._listener.handle_vehicle(self.vehicle)
 
-    def _choose_receiver(self, now_s: float) -> Receiver | None:
-        """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix."""
-        return self.receivers.choose_best(now_s, self._own_report)
+    def _choose_receiver(self, now_s: float, estimate_deg: tuple[float, float] | None = None) -> Receiver | None:
+        """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix.
+        `estimate_deg` is as in `Receivers.choose_best`."""
+        if estimate_deg is None and self.vehicle:
+            estimate_deg = self.vehicle.lat_deg, self.vehicle.lon_deg
+        return self.receivers.choose_best(now_s, self._own_report, estimate_deg)
 
     @property
     def _own_report(self) -> str | None:

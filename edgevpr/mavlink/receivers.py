@@ -7,7 +7,7 @@ is excluded. The autopilot's estimate, in contrast, may be derived from our posi
 import math
 from dataclasses import dataclass, replace
 
-from edgevpr.core.geodesy import offset_m, offset_position
+from edgevpr.core.geodesy import distance_m, offset_m, offset_position
 from edgevpr.core.types import Receiver
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -22,6 +22,7 @@ RECEIVER_LAG_S = 0.1
 _ACCURACY_UNKNOWN = (0, 2**32 - 1)  # values of h_acc: not sent, and unknown
 _SPEED_UNKNOWN = 2**16 - 1
 _MAX_STEP_M = 8.0  # between two reports, beyond the motion from the receiver's velocity: more is a jump
+_MAX_DISAGREEMENT_M = 10.0  # of two receivers, relative to the autopilot's estimate
 _MAX_GAP_S = 1.5  # a receiver that is silent for longer is no longer steady
 
 
@@ -40,13 +41,12 @@ class Receivers:
 
     def __init__(self) -> None:
         self._tracked: dict[str, _TrackedReceiver] = {}
-        self.received_s = -math.inf  # when the last GPS_RAW_INT arrived, with or without a fix
+        self._received_s = {GPS_REPORTS[0]: -math.inf}  # when the last report arrived, by name, with or without a fix
 
     def handle(self, message: Message, t_s: float, now_s: float) -> None:
         """Process a GPS_RAW_INT or GPS2_RAW that arrived at `now_s`, whose fix is of time `t_s`."""
         name = message.get_type()
-        if name == GPS_REPORTS[0]:
-            self.received_s = now_s
+        self._received_s[name] = now_s
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._tracked.pop(name, None)
             return
@@ -62,13 +62,27 @@ class Receivers:
         since_s = previous.steady_since_s if previous and is_steady else t_s
         self._tracked[name] = _TrackedReceiver(report, message.time_usec, since_s)
 
-    def choose_best(self, now_s: float, own: str | None = None) -> Receiver | None:
+    def is_report_missing(self, now_s: float, timeout_s: float) -> bool:
+        """Return True if no report of the first receiver, or none any more of the second, arrived in `timeout_s`."""
+        return now_s - min(self._received_s.values()) > timeout_s
+
+    def choose_best(
+        self, now_s: float, own: str | None = None, estimate_deg: tuple[float, float] | None = None
+    ) -> Receiver | None:
         """Return the newest report of the most accurate receiver with a fix in the last 2.5 s; None if there is none.
-        `own`: message name of the receiver that edgevpr simulates."""
+        Of receivers that contradict each other, the one nearest to the autopilot's estimate (`estimate_deg`, latitude
+        and longitude; None: unknown) counts: the autopilot uses it. `own`: message name of the receiver that edgevpr
+        simulates."""
         real = (tracked for name, tracked in self._tracked.items() if name != own)
         recent = [tracked for tracked in real if now_s - tracked.report.t_s <= GPS_TIMEOUT_S]
         if not recent:
             return None
+        if estimate_deg:
+            distances_m = [
+                float(distance_m(*estimate_deg, tracked.report.lat_deg, tracked.report.lon_deg)) for tracked in recent
+            ]
+            max_m = min(distances_m) + _MAX_DISAGREEMENT_M
+            recent = [tracked for tracked, away_m in zip(recent, distances_m, strict=True) if away_m <= max_m]
         best = min(recent, key=lambda tracked: tracked.report.sd_m)
         return replace(best.report, steady_for_s=best.report.t_s - best.steady_since_s)
 

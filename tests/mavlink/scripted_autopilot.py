@@ -116,12 +116,14 @@ class Autopilot:
         radians = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
         self.send(mavlink.MAVLink_attitude_message(self.boot_ms, *radians, 0, 0, 0))
 
-    def fly_on(self, seconds, attitude_hz):
+    def fly_on(self, seconds, attitude_hz, filter_flags=831):
         for _ in range(seconds * attitude_hz):
             self.wait(1 / attitude_hz)
             self.beat()
             self.position()
             self.attitude()
+            if filter_flags is not None:
+                self.filter(filter_flags)
 
     def range(self, distance_m, orientation=25, signal_quality=0):
         fields = 0, 20, 10_000, round(distance_m * 100), 0, 0, orientation, 0

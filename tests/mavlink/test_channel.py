@@ -130,6 +130,15 @@ def test_px4_gets_ten_positions_a_second_and_none_if_unknown():
     assert collect(autopilot, "GLOBAL_POSITION_SENSOR", 3.0) == []
 
 
+def test_ardupilot_with_odometry_is_asked_for_its_origin_until_it_arrives():
+    autopilot, _ = interview(VISO_TYPE=1, EK3_SRC2_POSXY=6)
+    asks = []
+    for _ in range(12):
+        autopilot.beat()
+        asks += [said.param1 for said in collect(autopilot, "COMMAND_LONG") if said.command == 512]
+    assert asks.count(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) > 1
+
+
 def test_px4_with_odometry_is_asked_for_its_origin_and_sent_positions_relative_to_it():
     autopilot, _ = interview(PX4, EKF2_AGP0_CTRL=0, EKF2_EV_CTRL=1, origin=Position(46.5, 7.5, 400.0))
     assert collect(autopilot, "ODOMETRY", 3.0) == []

@@ -43,6 +43,23 @@ def test_best_receiver_has_position_velocity_and_altitude_of_its_newest_report()
 
 
 @pytest.mark.parametrize(
+    ("second_m", "estimate_m", "chosen_m"), [(8.0, 0.0, 8.0), (80.0, 1.0, 0.0), (80.0, 78.0, 80.0), (80.0, None, 80.0)]
+)
+def test_best_of_receivers_that_contradict_each_other_is_the_one_that_the_autopilot_uses(
+    second_m, estimate_m, chosen_m
+):
+    receivers = receive((BEGIN_S, {}))
+    lat_deg, lon_deg = offset_position(*HOME, 0.0, second_m)
+    position = round(lat_deg * 1e7), round(lon_deg * 1e7), 300_000
+    fields = 3, *position, 100, 100, 0, 0, 10, 0, 0
+    second = mavlink.MAVLink_gps2_raw_message(round(BEGIN_S * 1e6), *fields, h_acc=400)  # more accurate
+    receivers.handle(second, BEGIN_S, BEGIN_S)
+    estimate_deg = None if estimate_m is None else offset_position(*HOME, 0.0, estimate_m)
+    best = receivers.choose_best(BEGIN_S + 1.0, estimate_deg=estimate_deg)
+    assert (best.lat_deg, best.lon_deg) == pytest.approx(offset_position(*HOME, 0.0, chosen_m), abs=1e-7)
+
+
+@pytest.mark.parametrize(
     ("after_s", "fields", "is_steady"),
     [
         (1.0, {"north_m": 17.9}, True),

@@ -118,6 +118,27 @@ def test_gps_reports_that_have_stopped_are_requested_again(autopilot):
     assert asked == {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GPS2_RAW}
 
 
+@pytest.mark.parametrize(
+    ("reports", "number"),
+    [
+        ([mavlink.MAVLink_gps_raw_int_message], mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT),
+        ([mavlink.MAVLink_gps_raw_int_message, mavlink.MAVLink_gps2_raw_message], mavlink.MAVLINK_MSG_ID_GPS2_RAW),
+    ],
+    ids=["filter", "second receiver"],
+)
+def test_any_report_that_has_stopped_is_requested_again(autopilot, reports, number):
+    autopilot.conversation.request_position()
+    for report in reports:
+        autopilot.gps(message=report)
+    autopilot.fly_on(seconds=6, attitude_hz=10)
+    autopilot.questions()
+    for _ in range(6):
+        autopilot.gps()
+        autopilot.fly_on(1, 10, None if number == mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT else 831)
+    asked = {each.param1 for each in autopilot.questions() if each.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
+    assert number in asked
+
+
 def test_vehicle_at_the_time_of_an_old_frame_is_that_of_then(autopilot):
     start_s = autopilot.clock.now_s
     for roll_deg in range(60):

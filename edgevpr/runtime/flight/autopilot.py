@@ -30,6 +30,7 @@ _UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
 _MIN_REPORTED_DELAY_S = 0.3
 
 _SOURCE_SET_RETRY_S = 2.0  # between two requests for a source set, until one is answered
+_MAX_GPS_DISTANCE_M = 25.0  # a steady receiver so near the map is not left: the next part of the map may be displaced
 _MIN_FLYING_HEIGHT_M = 5.0
 _MIN_GPS_GOOD_S = 3.0  # GPS must be good for this long before the source set with GPS is requested again
 
@@ -49,6 +50,7 @@ class AutopilotOutput:
         self._unanswered: list[tuple[str, FixTransmission]] = []
         self._held, self._is_holding = 0, False
         self._output = Output.STARTING  # last one reported
+        self._gps_distance_m = 0.0  # of the last match
         self._unknown_age = Alert(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN)
         self._delay_s = 0.0  # last one reported
 
@@ -189,6 +191,7 @@ class AutopilotOutput:
         is used, and no position is sent."""
         with self._link.take_turn("gps"):
             self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(distance_m)))
+            self._gps_distance_m = distance_m
             self._navigator.trust_gps(not is_wrong or not have_agreed)
             self._navigator.distrust_map(is_wrong and not have_agreed)
 
@@ -221,10 +224,12 @@ class AutopilotOutput:
             return
         navigator, stats = self._navigator, self._link.stats()
         is_sent = not is_paused and (navigator.output.is_sent or not self._link.channel.is_continuous)
+        has_receiver = vehicle.gps is not None and vehicle.gps.steady_for_s >= _MIN_GPS_GOOD_S
+        is_near = has_receiver and self._gps_distance_m <= _MAX_GPS_DISTANCE_M
         number = self._source_sets.choose_set(
             now_s,
-            has_gps=navigator.has_gps or vehicle.gps_is_silent,
-            has_receiver=vehicle.gps is not None and vehicle.gps.steady_for_s >= _MIN_GPS_GOOD_S,
+            has_gps=navigator.has_gps or vehicle.gps_is_silent or is_near,
+            has_receiver=has_receiver,
             has_own=is_sent and navigator.knows_position(now_s),
             is_flying=vehicle.height_m is not None and vehicle.height_m > _MIN_FLYING_HEIGHT_M,
             answered_s=stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf),

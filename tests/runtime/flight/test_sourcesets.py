@@ -74,6 +74,14 @@ def test_source_sets_treat_a_wrong_receiver_as_none():
     assert flown.fly(15).numbers == [2, 1]
 
 
+def test_source_sets_keep_a_receiver_that_is_near_the_map():
+    flown = AnsweringFlight(**SETS)
+    flown.autopilot.compare_gps(24.0, is_wrong=True, have_agreed=True)
+    assert flown.fly(6).numbers == [1]
+    flown.autopilot.compare_gps(26.0, is_wrong=True, have_agreed=True)
+    assert flown.fly(3).numbers == [1, 2]
+
+
 def test_source_sets_keep_a_receiver_that_never_agreed_with_the_map():
     flown = AnsweringFlight(**SETS)
     flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=False)
