@@ -263,8 +263,9 @@ class AutopilotOutput:
         """Count a fix that is held back because of `objection`, and report when a run of them begins and ends."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
-        if self._is_holding and not before:
-            gcs_text = "fix held back, contradicts autopilot"
+        if objection and not before:
+            is_first = objection.code is ReasonCode.HELD_UNCONFIRMED
+            gcs_text = "fix held back until another agrees" if is_first else "fix held back, contradicts autopilot"
             self._notifier.announce(Severity.WARNING, f"a fix is {objection}", gcs_text=gcs_text, topic="held back")
         elif before and not self._is_holding:
             self._notifier.announce(Severity.INFO, "fixes agree again", topic="held back")
