@@ -23,8 +23,10 @@ _GPS_CORRELATION_FACTOR = 2.0
 _GPS_VELOCITY_SD_M_S = 0.3
 _UNKNOWN_POSITION_SD_M = 1e4
 _UNKNOWN_VELOCITY_SD_M_S = 10.0  # while only a fix is known
-# A match that agrees with a rougher prediction proves nothing: a place that looks alike could agree too.
+# A match that agrees with a rougher prediction proves nothing: a place that looks alike could agree too. The next match
+# needs less, because it agrees with the first one.
 _MAX_PROVING_SD_M = 25.0
+_MAX_CONFIRMING_SD_M = 100.0
 _MAX_PROVING_RATIO = 2.0  # of the prediction's standard deviation to that of the match
 _NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
@@ -248,7 +250,8 @@ class Navigation:
             self.start_at_fix(match)
             self.is_confirmed = True
         elif self._path:
-            max_sd_m = max(_MAX_PROVING_SD_M, _MAX_PROVING_RATIO * compute_worst_sd(match.scatter_m2))
+            max_sd_m = _MAX_PROVING_SD_M if self.is_confirmed else _MAX_CONFIRMING_SD_M
+            max_sd_m = max(max_sd_m, _MAX_PROVING_RATIO * compute_worst_sd(match.scatter_m2))
             is_predicted = compute_worst_sd(fix.covariance_m2) <= max_sd_m
             self.is_confirmed = verdict.overrules_path or is_predicted
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
