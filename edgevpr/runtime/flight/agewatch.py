@@ -119,8 +119,9 @@ class AgeWatch:
 
     @property
     def delay_s(self) -> float:
-        """The delay to subtract, seconds; 0 if none is known."""
-        return self._delay.s if self._delay and abs(self._delay.s) > 2 * self._delay.sd_s else 0.0
+        """The delay to subtract, seconds; 0 if none is known, or if images seem to be newer than their times: a camera
+        that looks ahead of straight down looks so too, and its mount is measured only at the right times."""
+        return self._delay.s if self._delay and self._delay.s > 2 * self._delay.sd_s else 0.0
 
     def add_motion(self, t_s: float, velocity_m_s: Doubles, heading_deg: float | None, error: VelocityError) -> None:
         """Add the reported motion at `t_s`: velocity (2,), east and north, with its error, and heading."""

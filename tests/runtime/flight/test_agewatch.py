@@ -14,6 +14,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Frame, Position
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.level import LevelledImage
+from edgevpr.runtime.flight.agewatch import AgeWatch, Delay
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 
@@ -145,3 +146,13 @@ def test_check_age_reports_once_and_skips_the_match(tmp_path, clock, link):
     assert len([line for line in read_log(tmp_path / "log") if line["kind"] == "age"]) == 3
     assert summaries[0] is None
     assert summaries[1] == summaries[2] != summaries[3]
+
+
+def test_correct_claims_a_negative_delay_but_does_not_subtract_it():
+    """A camera that looks ahead of straight down looks as if its images were newer than their times."""
+    age, frame = AgeWatch(), Frame(image=PICTURE, name="", t_mono_s=1000.0, delay_sd_s=HIDDEN_DELAY_SD_S)
+    age._delay = Delay(-0.3, 0.05)
+    assert age.correct(frame).t_mono_s == 1000.0
+    assert age.correct(frame).t_sd_s > 0.3
+    age._delay = Delay(0.3, 0.05)
+    assert age.correct(frame).t_mono_s == pytest.approx(999.7)
