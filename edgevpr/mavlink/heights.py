@@ -53,6 +53,7 @@ class Heights:
         self.takeoff_m: float | None = None
         self.jumped_m = self.stepped_m = 0.0
         self._source: tuple[str, float] | None = None  # of the height, and how much higher it is than `takeoff_m`
+        self._range_offset_m = 0.0  # the same of the range finder, when it measured
         self.contradiction_m: float | None = None
         self._last: Altitudes | None = None
         self._is_standing = self._has_home = self._is_guess = self._has_jumped = False
@@ -71,6 +72,8 @@ class Heights:
             tilts_deg = (attitude.roll_deg, attitude.pitch_deg) if attitude else ()
             slant = math.prod(math.cos(math.radians(tilt_deg)) for tilt_deg in tilts_deg)
             self._range = (message.current_distance / 100 * max(0.0, slant), now_s) if is_good else None
+            if self._range:
+                self._range_offset_m = self._range[0] - (self.takeoff_m or 0.0)
 
     def handle_altitudes(self, altitudes: Altitudes, is_armed: bool, speed_m_s: float) -> None:
         """Process the altitudes of a GLOBAL_POSITION_INT; `speed_m_s` is its ground speed."""
@@ -98,12 +101,11 @@ class Heights:
         return self._compute_autopilot_height_m(now_s) if measured_m is None else measured_m
 
     def _sum_steps(self, now_s: float) -> None:
-        name = "take-off"
+        name, offset_m = "take-off", self._compute_autopilot_height_m(now_s) - (self.takeoff_m or 0.0)
         if self._get_recent(self._range, now_s, RANGE_MAX_AGE_S) is not None:
-            name = "range finder"
+            name, offset_m = "range finder", self._range_offset_m
         elif self._get_recent(self._terrain, now_s, TERRAIN_MAX_AGE_S) is not None:
             name = "terrain"
-        offset_m = self.compute_height_m(now_s) - (self.takeoff_m or 0.0)
         if self._source and name != self._source[0]:
             self.stepped_m += offset_m - self._source[1]
         self._source = name, offset_m

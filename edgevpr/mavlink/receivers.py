@@ -78,9 +78,7 @@ class Receivers:
         if not recent:
             return None
         if estimate_deg:
-            distances_m = [
-                float(distance_m(*estimate_deg, tracked.report.lat_deg, tracked.report.lon_deg)) for tracked in recent
-            ]
+            distances_m = [float(distance_m(*estimate_deg, *extrapolate(tracked.report, now_s))) for tracked in recent]
             max_m = min(distances_m) + _MAX_DISAGREEMENT_M
             recent = [tracked for tracked, away_m in zip(recent, distances_m, strict=True) if away_m <= max_m]
         best = min(recent, key=lambda tracked: tracked.report.sd_m)

@@ -13,6 +13,7 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Severity
+from edgevpr.mavlink.receivers import MAX_FIX_AGE_S
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
@@ -205,12 +206,13 @@ class AutopilotOutput:
         with self._link.take_turn("anew"):
             self._navigator.reset_navigation()
 
-    def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
+    def report(
+        self, health: messages.Health, load: MachineLoad, temperature_c: float | None, *, is_paused: bool
+    ) -> None:
         """Send health, load and temperature (None: unknown) of this computer, and request another source set if needed.
         Call it once a second."""
         with self._link.take_turn("report"):
             self._link.set_health(health)
-            is_paused = health is messages.Health.STANDBY
             self._request_source_set(is_paused)
             self._report_output(Output.PAUSED if is_paused else self._navigator.output)
             now_s, ram_bytes = self._clock.mono_s(), (load.ram_used_bytes, load.ram_total_bytes)
@@ -225,13 +227,15 @@ class AutopilotOutput:
         navigator, stats = self._navigator, self._link.stats()
         is_sent = not is_paused and (navigator.output.is_sent or not self._link.channel.is_continuous)
         has_receiver = vehicle.gps is not None and vehicle.gps.steady_for_s >= _MIN_GPS_GOOD_S
-        is_near = has_receiver and self._gps_distance_m <= _MAX_GPS_DISTANCE_M
+        # A lost receiver repeats its last fix.
+        is_new = vehicle.gps is not None and vehicle.gps.age_at_report_s <= MAX_FIX_AGE_S
+        is_near = has_receiver and is_new and self._gps_distance_m <= _MAX_GPS_DISTANCE_M
         number = self._source_sets.choose_set(
             now_s,
             has_gps=navigator.has_gps or vehicle.gps_is_silent or is_near,
             has_receiver=has_receiver,
             has_own=is_sent and navigator.knows_position(now_s),
-            is_flying=vehicle.height_m is not None and vehicle.height_m > _MIN_FLYING_HEIGHT_M,
+            is_flying=vehicle.height_m is not None and abs(vehicle.height_m) > _MIN_FLYING_HEIGHT_M,
             answered_s=stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf),
         )
         if number:

@@ -1,15 +1,17 @@
 """The innovation gate: checks each fix against its prediction from the path, for `navigator`."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
+from edgevpr.core.geodesy import offset_between_m
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.runtime.flight.measurements import PositionedMatch
-from edgevpr.runtime.recognise.locate import mahalanobis
+from edgevpr.runtime.recognise.locate import compute_worst_sd, mahalanobis
 
 # In standard deviations: one correct fix in 3000 is farther than this from its prediction.
 _MAX_INNOVATION_SIGMA = 4.0
@@ -110,6 +112,18 @@ class Consistency:
         if fix.match.heading_error_deg is not None:
             self._heading_error_deg = fix.match.heading_error_deg
         return verdict
+
+
+def confirm_each_other(matches: Sequence[PositionedMatch]) -> bool:
+    """Return True if successive matches that agree with each other, but that nothing else supports, show the position:
+    the first and the last are of other places, or farther apart than their errors explain, or there are four."""
+    if len(matches) < 2:
+        return False
+    first, last = matches[0], matches[-1]
+    apart_m = math.hypot(*offset_between_m(first.position, last.position))
+    sd_m = math.hypot(compute_worst_sd(first.scatter_m2), compute_worst_sd(last.scatter_m2))
+    is_independent = last.shares_no_place_with(first) or apart_m > _MAX_INNOVATION_SIGMA * sd_m
+    return is_independent or len(matches) >= _FIXES_TO_OVERRULE_TRACK
 
 
 def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:

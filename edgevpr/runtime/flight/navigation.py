@@ -9,7 +9,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import move_position
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import MAX_FIX_AGE_S, RECEIVER_LAG_S, extrapolate
-from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix
+from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix, confirm_each_other
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
 from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
@@ -23,11 +23,9 @@ _GPS_CORRELATION_FACTOR = 2.0
 _GPS_VELOCITY_SD_M_S = 0.3
 _UNKNOWN_POSITION_SD_M = 1e4
 _UNKNOWN_VELOCITY_SD_M_S = 10.0  # while only a fix is known
-# A match that agrees with a rougher prediction proves nothing: a place that looks alike could agree too. The next match
-# needs less, because it agrees with the first one.
+# A match that agrees with a rougher prediction, and is farther from it than two of these, proves nothing: a place that
+# looks alike could agree too.
 _MAX_PROVING_SD_M = 25.0
-_MAX_CONFIRMING_SD_M = 100.0
-_MAX_PROVING_RATIO = 2.0  # of the prediction's standard deviation to that of the match
 _NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
 _MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
@@ -75,6 +73,9 @@ class Navigation:
         self._last_fix_m: Doubles | None = None  # (2,) from the origin of the path
         self.has_gps = self.is_in_doubt = False
         self.is_confirmed = True
+        self._unconfirmed: list[
+            PositionedMatch
+        ] = []  # matches that agree with each other, and that nothing else supports
         self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
         self._odometry_since_fix = _OdometrySinceFix()
@@ -250,10 +251,7 @@ class Navigation:
             self.start_at_fix(match)
             self.is_confirmed = True
         elif self._path:
-            max_sd_m = _MAX_PROVING_SD_M if self.is_confirmed else _MAX_CONFIRMING_SD_M
-            max_sd_m = max(max_sd_m, _MAX_PROVING_RATIO * compute_worst_sd(match.scatter_m2))
-            is_predicted = compute_worst_sd(fix.covariance_m2) <= max_sd_m
-            self.is_confirmed = verdict.overrules_path or is_predicted
+            self._judge_support(fix, verdict)
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
@@ -262,6 +260,16 @@ class Navigation:
                 self._filter.correct_by_rotation(math.radians(match.heading_error_deg))
             self.last_fix_s = max(self.last_fix_s, match.t_s)
             self._odometry_since_fix = _OdometrySinceFix(self.last_fix_s)
+
+    def _judge_support(self, fix: PredictedFix, verdict: GateResult) -> None:
+        """Update `is_confirmed` with an accepted fix."""
+        predicted_sd_m, match = compute_worst_sd(fix.covariance_m2), fix.match
+        agrees = min(predicted_sd_m, float(np.hypot(*fix.innovation_m)) / 2) <= _MAX_PROVING_SD_M
+        agrees |= predicted_sd_m <= compute_worst_sd(match.scatter_m2)
+        agrees &= predicted_sd_m < _UNKNOWN_POSITION_SD_M / 2  # otherwise the path starts at this match
+        self._unconfirmed = [*self._unconfirmed, match] if agrees and not self.is_confirmed else [match]
+        is_supported = agrees and (self.is_confirmed or confirm_each_other(self._unconfirmed))
+        self.is_confirmed = verdict.overrules_path or is_supported
 
     def _repetition_factor(self, fix: PredictedFix) -> float:
         """Return the factor for the covariance of a fix: the closer it is to the last fix, the more of its error is

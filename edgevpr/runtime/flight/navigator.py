@@ -6,7 +6,7 @@ The link calls it in its own thread, the loop of `flight` (through `autopilot`) 
 import math
 from dataclasses import dataclass, replace
 
-from edgevpr.core.geodesy import distance_m, offset_position
+from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
@@ -16,10 +16,11 @@ from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4_INERTIAL_ERROR, AgeWatch, VelocityError
-from edgevpr.runtime.flight.consistency import Consistency
+from edgevpr.runtime.flight.consistency import Consistency, confirm_each_other
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
+    PositionedMatch,
     compute_reported_accuracy_m,
     compute_time_error_m,
     measure_frame,
@@ -47,7 +48,7 @@ _ALT_SD_M = 3.0
 # Odometry is corrected if its scale differs by more from the height of one match, or from the median of three.
 _MATCH_SCALE_TOLERANCE = 0.15
 # Two fixes that nothing predicts confirm each other if they are at most so far apart, and an aircraft could fly there.
-_MAX_UNCONFIRMED_S = 30.0
+_MAX_UNCONFIRMED_S = 120.0
 _MAX_SPEED_M_S = 30.0
 _SCALE_TOLERANCE = 0.02
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
@@ -97,7 +98,7 @@ class Navigator(Listener):
         self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
-        self._unconfirmed: Fix | None = None  # the last fix that nothing predicted
+        self._unconfirmed: list[PositionedMatch] = []  # successive matches that nothing predicted
         self._height_ratio, self._height_ratio_sd = 1.0, 0.0
         self._resolved_doubt_m = self._resolved_step_m = 0.0  # differences of height that matches have resolved
         # Standard deviation of the error common to the last fixes, and its part that is due to a tilt of the camera.
@@ -146,7 +147,7 @@ class Navigator(Listener):
 
     def handle_autopilot(self, t_s: float) -> None:
         """Process the first message of an autopilot, or of its replacement, at `t_s`."""
-        self._autopilot_since_s, self._vehicle = t_s, None
+        self._autopilot_since_s, self._vehicle, self._resolved_step_m = t_s, None, 0.0
 
     def handle_no_position(self, t_s: float) -> None:
         """Process a report that the autopilot has no position."""
@@ -204,7 +205,7 @@ class Navigator(Listener):
                 return _withhold(ReasonCode.CONTINUOUS if self._channel.is_continuous else ReasonCode.NO_TELEMETRY)
             self._navigation.start_at_fix(match)
             self._correct_scale(event, vehicle)
-            return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else self._confirm(fix)
+            return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else self._confirm(fix, match)
         verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
         if verdict.reason:
             return Advice(None, verdict.reason, is_held=True)
@@ -308,17 +309,20 @@ class Navigator(Listener):
         has_none = now_s - self._no_position_s <= _REPORT_TIMEOUT_S < now_s - since_s
         return Advice(fix) if has_none and not self._channel.is_continuous else _withhold(ReasonCode.NO_TELEMETRY)
 
-    def _confirm(self, fix: Fix) -> Advice:
-        """Advise on a fix that nothing predicts: it is held back until another agrees, within what can be flown."""
-        before, self._unconfirmed = self._unconfirmed, fix
-        if before is None or not 0 < fix.t_frame_s - before.t_frame_s <= _MAX_UNCONFIRMED_S:
-            return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
-        reach_m = _MAX_SPEED_M_S * (fix.t_frame_s - before.t_frame_s) + 3 * math.hypot(
-            fix.accuracy_m, before.accuracy_m
-        )
-        if distance_m(before.lat_deg, before.lon_deg, fix.lat_deg, fix.lon_deg) > reach_m:
-            return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
-        return Advice(fix)
+    def _confirm(self, fix: Fix, match: PositionedMatch) -> Advice:
+        """Advise on the fix of a match that nothing predicts: it is held back until others agree, within what can be
+        flown."""
+        if self._unconfirmed:
+            before = self._unconfirmed[-1]
+            elapsed_s = match.t_s - before.t_s
+            reach_m = _MAX_SPEED_M_S * elapsed_s + 3 * math.hypot(match.accuracy_m, before.accuracy_m)
+            away_m = math.hypot(*offset_between_m(before.position, match.position))
+            if not 0 < elapsed_s <= _MAX_UNCONFIRMED_S or away_m > reach_m:
+                self._unconfirmed = []
+        self._unconfirmed = [*self._unconfirmed[-3:], match]
+        if confirm_each_other(self._unconfirmed):
+            return Advice(fix)
+        return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
 
     def _correct_scale(self, event: Recognition, vehicle: Vehicle) -> None:
         """Correct the scale of odometry by the height that the accepted match of an event shows."""

@@ -329,6 +329,17 @@ def test_match_that_nothing_predicts_is_sent_if_it_confirms_another(later_s, off
     assert (fix and (fix.accuracy_m, fix.t_frame_s)) == ((1.5, NOW_S + later_s) if is_sent else None)
 
 
+def test_matches_of_one_place_in_a_hover_confirm_each_other_after_four():
+    navigator, sent = navigate(), []
+    navigator._navigation.contradicts_m = None
+    for second in range(5):
+        event = fake_match()
+        frame = replace(event.frame, t_mono_s=NOW_S + second)
+        navigator.handle_vehicle(replace(navigator._vehicle, t_received_s=NOW_S + second))
+        sent.append(navigator.advise(replace(event, frame=frame), NOW_S + second).fix is not None)
+    assert sent == [False, False, False, True, True]
+
+
 def test_match_that_agrees_with_a_rough_prediction_is_sent_if_another_confirms_it():
     navigator = navigate(off_m=(10.0, 0.0))
     navigator._navigation.is_confirmed = False

@@ -218,6 +218,16 @@ def test_a_plane_gets_no_fix_of_a_single_match_that_nothing_confirms(restarts):
     assert flight.error_m[-1] < 10
 
 
+@pytest.mark.parametrize(("every_s", "fixes"), [(20, 40), (60, 6)])
+def test_a_plane_gets_fixes_of_rare_matches_without_odometry(every_s, fixes):
+    """Each is predicted to no better than 36 and 180 m in wind; single fixes follow a match for up to a minute."""
+    flight = ClosedLoop("arduplane", velocity_m_s=15j).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).set("SIM_WIND_SPD", 6)
+    flight.sees_motion, flight.match_every = False, every_s
+    assert len(flight.fly(200).positions_sent(flight.now_s - 200)) >= fixes
+    assert flight.error_m[-1] < 300
+
+
 @pytest.mark.parametrize(("map_off_m", "parameters"), [(8, SENSOR), (20, VISION)])
 def test_px4_uses_gps_again_after_a_test_without_gps(map_off_m, parameters):
     def suspend_gps(flight):

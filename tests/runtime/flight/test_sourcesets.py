@@ -38,7 +38,7 @@ class AnsweringFlight(SimFlight):
             super().fly(1)
             self.clock.now_s = self.t_s
             self.link.sent.clear()
-            self.autopilot.report(self.health, LOAD, None)
+            self.autopilot.report(self.health, LOAD, None, is_paused=self.health is Health.STANDBY)
             commands = [each for each in self.link.sent if each.get_type() == "COMMAND_LONG"]
             to = {(each.command, each.target_system, each.target_component) for each in commands}
             assert to <= {(SET_SOURCE_SET, 1, 1)}
