@@ -101,6 +101,7 @@ class Heights:
         return self._compute_autopilot_height_m(now_s) if measured_m is None else measured_m
 
     def _sum_steps(self, now_s: float) -> None:
+        """Add the step of the height to `stepped_m` if its source has changed since the last report."""
         name, offset_m = "take-off", self._compute_autopilot_height_m(now_s) - (self.takeoff_m or 0.0)
         if self._get_recent(self._range, now_s, RANGE_MAX_AGE_S) is not None:
             name, offset_m = "range finder", self._range_offset_m

@@ -73,9 +73,7 @@ class Navigation:
         self._last_fix_m: Doubles | None = None  # (2,) from the origin of the path
         self.has_gps = self.is_in_doubt = False
         self.is_confirmed = True
-        self._unconfirmed: list[
-            PositionedMatch
-        ] = []  # matches that agree with each other, and that nothing else supports
+        self._unconfirmed: list[PositionedMatch] = []  # agree with each other; nothing else supports them
         self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
         self._odometry_since_fix = _OdometrySinceFix()
