@@ -27,6 +27,7 @@ STATE_INTERVAL_S = 0.1  # ArduPilot treats a GPS receiver as unhealthy if its po
 HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy while the link's thread still runs
 INTERIM_FIX_INTERVAL_S = 0.5  # between fixes sent without a new match
 REQUEST_INTERVAL_S = 5.0
+MIN_GPS_INPUTS = 100  # sent in ten seconds, after which the autopilot reports this receiver
 ORIGIN_TIMEOUT_S = 5.0  # an autopilot with an origin sends it once a second on request
 
 log = logging.getLogger(__name__)
@@ -73,7 +74,7 @@ class Conversation:
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
         self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
-        self._is_gps_silent = False  # last announced state
+        self._is_gps_silent = self._is_ignored = False  # last announced states
 
     @property
     def channel(self) -> Channel:
@@ -185,6 +186,11 @@ class Conversation:
             self._is_gps_silent = is_gps_silent
             text = "GPS reports stopped: requested again" if is_gps_silent else "GPS reports arrive again"
             self.announce(Severity.WARNING if is_gps_silent else Severity.INFO, text, "GPS reports")
+        is_ignored = self.sent["GPS_INPUT"] >= MIN_GPS_INPUTS and self.autopilot.ignores_gps_input(now_s)
+        if is_ignored != self._is_ignored:
+            self._is_ignored = is_ignored
+            text = "autopilot ignores GPS_INPUT: reboot it" if is_ignored else "autopilot uses GPS_INPUT"
+            self.announce(Severity.WARNING if is_ignored else Severity.INFO, text, "GPS_INPUT")
         self.fixes.report_silence(self.autopilot.assess_readiness(now_s).silence_reason, now_s)
         while self._reports:
             self.announce(*self._reports.pop(0))

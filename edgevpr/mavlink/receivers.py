@@ -62,6 +62,10 @@ class Receivers:
         since_s = previous.steady_since_s if previous and is_steady else t_s
         self._tracked[name] = _TrackedReceiver(report, message.time_usec, since_s)
 
+    def get_received_s(self, name: str) -> float:
+        """Return the time when the last report of a receiver arrived, by the name of its message; -inf if none has."""
+        return self._received_s.get(name, -math.inf)
+
     def is_report_missing(self, now_s: float, timeout_s: float) -> bool:
         """Return True if no report of the first receiver, or none any more of the second, arrived in `timeout_s`."""
         return now_s - min(self._received_s.values()) > timeout_s

@@ -207,3 +207,18 @@ def test_conversation_sends_a_fix_between_matches_after_half_a_second():
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)
     autopilot.beat()
     assert collect(autopilot, "COMMAND_INT", 4.0) == [], "its velocity follows a fix"
+
+
+def test_ardupilot_that_does_not_report_our_receiver_is_to_be_rebooted():
+    """A new GPS2_TYPE is used after a reboot only; a receiver that is used is reported (real ArduPilot 4.7-dev)."""
+    autopilot, _ = interview(GPS2_TYPE=14)
+    texts = []
+    for second in range(30):
+        autopilot.beat()
+        if second >= 20:
+            autopilot.gps(message=mavlink.MAVLink_gps2_raw_message)
+        texts += [said.text.removeprefix("edgevpr: ") for said in collect(autopilot, "STATUSTEXT")]
+    assert [text for text in texts if "GPS_INPUT" in text] == [
+        "autopilot ignores GPS_INPUT: reboot it",
+        "autopilot uses GPS_INPUT",
+    ]
