@@ -43,6 +43,7 @@ _TILT_RUN_LENGTH = 12  # frames of a video are so close together that only every
 _VIDEO_PICTURES = 10  # taken from a video, a second apart
 _TILT_VIDEO_PICTURES = 60
 _MAX_LEVEL_DEG = 5.0
+_MAX_REPEATED = 0.8  # of successive images with the same position; three exposures of each make two thirds
 _MAX_WRONG_TILT_DEG = 25.0  # from a recorded direction: a slope in one direction looks like a tilt
 _MAX_LANDMARKS = 500
 # Chosen on corridor and grief_stromovka_seasons (forward: at most 12 degrees and 0.07 of vertical motion), and on
@@ -79,8 +80,16 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
     if pictures.folder:
         table = pictures.positions or find_positions(pictures.folder)
         tags = read_table(pictures.folder, pictures.positions)
-        paths = [path for run in _choose_runs(pictures.folder) for path in run]
-        has_position = any((tags.get(path.name) or read_exif(path)).position for path in paths)
+        runs = _choose_runs(pictures.folder)
+        paths = [path for run in runs for path in run]
+        positions = {path: (tags.get(decode_name(path.name)) or read_exif(path)).position for path in paths}
+        has_position = any(positions.values())
+        points = {path: position and (position.lat_deg, position.lon_deg) for path, position in positions.items()}
+        pairs = [(points[one], points[other]) for run in runs for one, other in pairwise(run)]
+        repeated = sum(one is not None and one == other for one, other in pairs)
+        if repeated > _MAX_REPEATED * len(pairs):
+            text = "%d of %d images that were compared have exactly the position of the image before: was GPS frozen?"
+            _log.warning(text, repeated, len(pairs))
     elif not pictures.rate_hz:
         with closing(_open_video(uri)) as video:
             duration_s = video.total

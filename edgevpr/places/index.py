@@ -20,6 +20,7 @@ from edgevpr.places.mapfile import PlaceMap
 
 _log = logging.getLogger(__name__)
 _METADATA_BYTES = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
+_MIN_STEP_M = 1.0  # between two positions; below it, they are one
 _PACK_BATCH = 32  # places
 _BLOCK_PLACES = 256  # the minimum of each block is stored, to find the overall minimum quickly
 _OUTLINE_DTYPE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
@@ -61,10 +62,12 @@ class PlaceIndex:
         return replace(self, **{name: array[slots] for name, array in self.arrays.items()})
 
     def spacing_m(self) -> float | None:
-        """Return the median distance in metres between successive places; None if no two in a row have positions."""
+        """Return the median distance in metres between successive places, without those taken at one position (exposure
+        brackets); None if no two in a row have positions."""
         steps_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
         steps_m = steps_m[~np.isnan(steps_m)]
-        return float(np.median(steps_m)) if len(steps_m) else None
+        apart_m = steps_m[steps_m >= _MIN_STEP_M]
+        return float(np.median(apart_m if len(apart_m) else steps_m)) if len(steps_m) else None
 
     def find_within(self, position: Position, radius_m: float) -> Bools:
         """Return bool (N,), True for each place within `radius_m` metres of `position`; False if it has no position."""

@@ -13,7 +13,7 @@ from edgevpr.core.types import Position
 from edgevpr.frames.exif import read_exif, read_fov_deg
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
-from edgevpr.mapmaking.advice import require_one_lens, suggest_lens
+from edgevpr.mapmaking.advice import require_one_lens, suggest_lens, warn_of_gaps
 from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import create
@@ -149,3 +149,13 @@ def test_map_build_refuses_and_reports_wide_and_tele_pictures_in_one_folder(foca
     caplog.set_level("INFO")
     suggest_lens(pictures, SourceConfig(), create("cohog", {"camera": "nadir"}))
     assert ("pass --fov-deg 72" if is_accepted else "from 40 to 72 degrees") in caplog.text
+
+
+@pytest.mark.parametrize(("images_each", "is_reported"), [(1, False), (3, False), (12, True)])
+def test_map_build_asks_whether_gps_was_frozen(tmp_path, caplog, images_each, is_reported):
+    for number in range(12):
+        photographs.write_jpeg(
+            tmp_path / f"{number:02d}.jpg", GPS | {LAT: (46.0, number // images_each, 0.0), ALT: number}
+        )
+    warn_of_gaps(FlightPictures(source=str(tmp_path)), 0, None)
+    assert ("was GPS frozen?" in caplog.text) == is_reported

@@ -49,6 +49,11 @@ def test_index_is_contiguous_and_has_the_promised_size(ruler):
     assert index.nbytes == 25 * compute_place_bytes(technique.spec)
     assert index.rows.flags.c_contiguous
     assert index.spacing_m() == pytest.approx(44.5, abs=0.1)
+    index.lat_deg[1::3], index.lon_deg[1::3] = index.lat_deg[::3][:8], index.lon_deg[::3][:8]
+    index.lat_deg[2::3], index.lon_deg[2::3] = index.lat_deg[::3][:8], index.lon_deg[::3][:8]
+    assert index.spacing_m() == pytest.approx(3 * 44.5, abs=0.3), "three images at each position"
+    index.lat_deg[:], index.lon_deg[:] = 50.0, 8.0
+    assert index.spacing_m() == 0.0
 
 
 def test_load_index_beyond_the_budget_keeps_the_best_places_in_ram_and_all_on_disk(ruler_map, caplog):
