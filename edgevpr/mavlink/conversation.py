@@ -27,7 +27,7 @@ STATE_INTERVAL_S = 0.1  # ArduPilot treats a GPS receiver as unhealthy if its po
 HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy while the link's thread still runs
 INTERIM_FIX_INTERVAL_S = 0.5  # between fixes sent without a new match
 REQUEST_INTERVAL_S = 5.0
-MIN_GPS_INPUTS = 100  # sent in ten seconds, after which the autopilot reports this receiver
+MAX_UNREPORTED_INPUTS = 100  # GPS_INPUT of ten seconds: an autopilot that uses this receiver reports it
 ORIGIN_TIMEOUT_S = 5.0  # an autopilot with an origin sends it once a second on request
 
 log = logging.getLogger(__name__)
@@ -75,6 +75,8 @@ class Conversation:
         self._has_requested_pressure = False
         self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
         self._is_gps_silent = self._is_ignored = False  # last announced states
+        self._own_report_s = -math.inf  # time of the autopilot's last report of the receiver that we simulate
+        self._reported_inputs = 0  # number of GPS_INPUT messages sent until then
 
     @property
     def channel(self) -> Channel:
@@ -186,14 +188,24 @@ class Conversation:
             self._is_gps_silent = is_gps_silent
             text = "GPS reports stopped: requested again" if is_gps_silent else "GPS reports arrive again"
             self.announce(Severity.WARNING if is_gps_silent else Severity.INFO, text, "GPS reports")
-        is_ignored = self.sent["GPS_INPUT"] >= MIN_GPS_INPUTS and self.autopilot.ignores_gps_input(now_s)
-        if is_ignored != self._is_ignored:
-            self._is_ignored = is_ignored
-            text = "autopilot ignores GPS_INPUT: reboot it" if is_ignored else "autopilot uses GPS_INPUT"
-            self.announce(Severity.WARNING if is_ignored else Severity.INFO, text, "GPS_INPUT")
+        self._check_own_receiver()
         self.fixes.report_silence(self.autopilot.assess_readiness(now_s).silence_reason, now_s)
         while self._reports:
             self.announce(*self._reports.pop(0))
+
+    def _check_own_receiver(self) -> None:
+        """Announce if the autopilot does not report the receiver that we simulate, because it uses a new `GPSn_TYPE`
+        only after a reboot, and when it does."""
+        own_report_s = self.autopilot.own_report_s
+        if own_report_s is None or own_report_s != self._own_report_s:  # another channel, a new report, or a restart
+            self._own_report_s = -math.inf if own_report_s is None else own_report_s
+            self._reported_inputs = self.sent["GPS_INPUT"]
+        if self.sent["GPS_INPUT"] - self._reported_inputs >= MAX_UNREPORTED_INPUTS and not self._is_ignored:
+            self._is_ignored = True
+            self.announce(Severity.WARNING, "autopilot ignores GPS_INPUT: reboot it", "GPS_INPUT")
+        elif self._is_ignored and self._own_report_s > -math.inf:
+            self._is_ignored = False
+            self.announce(Severity.INFO, "autopilot uses GPS_INPUT", "GPS_INPUT")
 
     def handle_port_loss(self, lost_fixes: int) -> None:
         """Reset the state after the port was lost. `lost_fixes`: number of fixes discarded with it."""

@@ -40,7 +40,6 @@ _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
 _ORIGIN_TIMEOUT_S = 2.0  # an autopilot that has not answered the request in this time has no origin
 _ORIGIN_REQUEST_INTERVAL_S = 10.0
-_OWN_REPORT_TIMEOUT_S = 10.0
 REPLACEMENT_SILENCE_S = 30.0  # a flight controller restarts within 20 s
 _OTHER_TIMEOUT_S = 10.0  # without a heartbeat of another vehicle, the link counts as ours alone
 
@@ -192,11 +191,10 @@ class Autopilot:
         """Return True if another vehicle's autopilot would use the positions that we send as well."""
         return self.selector.choice.channel.is_untargeted and self.identity.shares_link(now_s)
 
-    def ignores_gps_input(self, now_s: float) -> bool:
-        """Return True if the autopilot has not reported the receiver that we simulate for ten seconds: it reports one
-        that it uses, but uses a new `GPSn_TYPE` only after a reboot."""
-        own = self._own_report
-        return own is not None and now_s - self.receivers.get_received_s(own) > _OWN_REPORT_TIMEOUT_S
+    @property
+    def own_report_s(self) -> float | None:
+        """Time of the last report of the receiver that we simulate (-inf: none yet; None: we simulate none)."""
+        return None if self._own_report is None else self.receivers.get_received_s(self._own_report)
 
     def is_alive(self, now_s: float) -> bool:
         """Return True if a heartbeat of the autopilot arrived through the current port in the last five seconds."""

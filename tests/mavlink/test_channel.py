@@ -222,3 +222,24 @@ def test_ardupilot_that_does_not_report_our_receiver_is_to_be_rebooted():
         "autopilot ignores GPS_INPUT: reboot it",
         "autopilot uses GPS_INPUT",
     ]
+
+
+def test_autopilot_that_has_restarted_is_not_to_be_rebooted_again():
+    autopilot, _ = interview(GPS2_TYPE=14)
+    texts = []
+
+    def fly(seconds):
+        for _ in range(seconds):
+            autopilot.beat()
+            autopilot.gps(message=mavlink.MAVLink_gps2_raw_message)
+            texts.extend(said.text for said in collect(autopilot, "STATUSTEXT"))
+
+    fly(15)
+    autopilot.reboot()
+    for _ in range(12):
+        autopilot.wait(0.25)
+        autopilot.beat()
+        autopilot.reply(ARDUPILOT_PARAMETERS | {"GPS2_TYPE": 14})
+    fly(15)
+    assert autopilot.conversation.channel is Channel.GPS_INPUT
+    assert not [text for text in texts if "ignores" in text or "uses" in text]
