@@ -124,4 +124,4 @@ def _find_common_offset(offsets_m: Sequence[complex], claimed_m: float) -> compl
     middle_m = complex(median(each.real for each in offsets_m), median(each.imag for each in offsets_m))
     distances_m = sorted(abs(each - middle_m) for each in offsets_m)
     scatter_m = distances_m[math.ceil(_NEARLY_ALL * len(distances_m)) - 1]
-    return middle_m if abs(middle_m) > max(2 * claimed_m, 2 * scatter_m) else None
+    return middle_m if abs(middle_m) > 2 * max(claimed_m, scatter_m) else None

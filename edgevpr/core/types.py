@@ -74,11 +74,11 @@ class Vehicle:
     `roll_deg`, `pitch_deg`: positive for right wing down and for nose up; `tilt_rate_deg_s`: rate of both together.
     `height_m`: above ground; `height_doubt_m`: by how much its sources disagree; `height_step_m`: sum of its steps at
     changes of its source. `velocity_m_s`: over ground (east, north). `sink_m_s`: velocity down. `innovation_ratio`:
-    innovation of measured positions over the filter's gate;
-    above 1 the filter refuses them. `has_position`: the filter has a position. `gps`: newest receiver position, near
-    the estimate or not (None: none is recent). `gps_is_silent`: reports of a receiver with a fix have stopped, so it is
-    unknown whether it still has one. `reaches_another`: another vehicle's autopilot would use our positions as well.
-    `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
+    innovation of measured positions over the filter's gate; above 1 the filter refuses them. `has_position`: the filter
+    has a position. `gps`: newest receiver position, near the estimate or not (None: none is recent). `gps_is_silent`:
+    reports of a receiver with a fix have stopped, so it is unknown whether it still has one. `reaches_another`: another
+    vehicle's autopilot would use our positions as well. `t_fix_s`: time of the newest fix from edgevpr that may already
+    affect the position (-inf: none does)."""
 
     lat_deg: float
     lon_deg: float

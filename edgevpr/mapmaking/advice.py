@@ -80,13 +80,13 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
     if pictures.folder:
         table = pictures.positions or find_positions(pictures.folder)
         tags = read_table(pictures.folder, pictures.positions)
-        runs = _choose_runs(pictures.folder)
-        paths = [path for run in runs for path in run]
-        positions = {path: (tags.get(decode_name(path.name)) or read_exif(path)).position for path in paths}
-        has_position = any(positions.values())
-        points = {path: position and (position.lat_deg, position.lon_deg) for path, position in positions.items()}
-        pairs = [(points[one], points[other]) for run in runs for one, other in pairwise(run)]
-        repeated = sum(one is not None and one == other for one, other in pairs)
+        runs = [
+            [(tags.get(decode_name(path.name)) or read_exif(path)).position for path in run]
+            for run in _choose_runs(pictures.folder)
+        ]
+        has_position = any(map(any, runs))
+        pairs = [(one, other) for run in runs for one, other in pairwise(run) if one and other]
+        repeated = sum((one.lat_deg, one.lon_deg) == (other.lat_deg, other.lon_deg) for one, other in pairs)
         if repeated > _MAX_REPEATED * len(pairs):
             text = "%d of %d images that were compared have exactly the position of the image before: was GPS frozen?"
             _log.warning(text, repeated, len(pairs))

@@ -102,11 +102,11 @@ class Heights:
 
     def _sum_steps(self, now_s: float) -> None:
         """Add the step of the height to `stepped_m` if its source has changed since the last report."""
-        name, offset_m = "take-off", self._compute_autopilot_height_m(now_s) - (self.takeoff_m or 0.0)
+        name, offset_m = "take-off", 0.0
         if self._get_recent(self._range, now_s, RANGE_MAX_AGE_S) is not None:
             name, offset_m = "range finder", self._range_offset_m
-        elif self._get_recent(self._terrain, now_s, TERRAIN_MAX_AGE_S) is not None:
-            name = "terrain"
+        elif (terrain_offset_m := self._find_terrain_offset_m(now_s)) is not None:
+            name, offset_m = "terrain", terrain_offset_m
         if self._source and name != self._source[0]:
             self.stepped_m += offset_m - self._source[1]
         self._source = name, offset_m
@@ -177,11 +177,12 @@ class Heights:
             self._takeoff_terrain_m = report.terrain_height + report.current_height - self.takeoff_m
 
     def _compute_autopilot_height_m(self, now_s: float) -> float:
+        return (self.takeoff_m or 0.0) + (self._find_terrain_offset_m(now_s) or 0.0)
+
+    def _find_terrain_offset_m(self, now_s: float) -> float | None:
+        """Return by how much the ground below is lower than the take-off point; None without recent terrain data."""
         terrain_m = self._get_recent(self._terrain, now_s, TERRAIN_MAX_AGE_S)
-        takeoff_m = self.takeoff_m or 0.0
-        if terrain_m is None or self._takeoff_terrain_m is None:
-            return takeoff_m
-        return takeoff_m + self._takeoff_terrain_m - terrain_m
+        return None if terrain_m is None or self._takeoff_terrain_m is None else self._takeoff_terrain_m - terrain_m
 
     @staticmethod
     def _get_recent(measured: tuple[float, float] | None, now_s: float, max_age_s: float) -> float | None:

@@ -12,7 +12,7 @@ import csv
 import hashlib
 import io
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,13 +84,12 @@ def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth,
     return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries), copied)
 
 
-def _count_copies(queries: Iterable[Path], references: Sequence[Path]) -> int:
+def _count_copies(queries: Iterable[Path], references: Iterable[Path]) -> int:
     """Return the number of `queries` whose file has the same content as one of `references`."""
-    sizes = {path.stat().st_size for path in references}
-    candidates = [path for path in queries if path.stat().st_size in sizes]
-    sizes = {path.stat().st_size for path in candidates}
-    digests = {_compute_digest(path) for path in references if path.stat().st_size in sizes} - {None}
-    return sum(_compute_digest(path) in digests for path in candidates)
+    reference_sizes, query_sizes = ({path: path.stat().st_size for path in paths} for paths in (references, queries))
+    sizes = {*reference_sizes.values()} & {*query_sizes.values()}  # only files of equal size are read
+    digests = {_compute_digest(path) for path, size in reference_sizes.items() if size in sizes} - {None}
+    return sum(_compute_digest(path) in digests for path, size in query_sizes.items() if size in sizes)
 
 
 def _compute_digest(path: Path) -> bytes | None:

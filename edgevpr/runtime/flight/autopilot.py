@@ -13,9 +13,9 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Severity
-from edgevpr.mavlink.receivers import MAX_FIX_AGE_S
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.navigation import is_gps_aided
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Alert, Notifier
 from edgevpr.runtime.flight.output import Output
@@ -227,9 +227,7 @@ class AutopilotOutput:
         navigator, stats = self._navigator, self._link.stats()
         is_sent = not is_paused and (navigator.output.is_sent or not self._link.channel.is_continuous)
         has_receiver = vehicle.gps is not None and vehicle.gps.steady_for_s >= _MIN_GPS_GOOD_S
-        # A lost receiver repeats its last fix.
-        is_new = vehicle.gps is not None and vehicle.gps.age_at_report_s <= MAX_FIX_AGE_S
-        is_near = has_receiver and is_new and self._gps_distance_m <= _MAX_GPS_DISTANCE_M
+        is_near = has_receiver and is_gps_aided(vehicle) and self._gps_distance_m <= _MAX_GPS_DISTANCE_M
         number = self._source_sets.choose_set(
             now_s,
             has_gps=navigator.has_gps or vehicle.gps_is_silent or is_near,

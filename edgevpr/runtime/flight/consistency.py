@@ -24,6 +24,7 @@ _TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
 _FIXES_TO_OVERRULE_TRACK = 4
 _MAX_ROUTE_INTERVAL_S = 10.0
 _MAX_SPEED_M_S = 30.0
+_MAX_UNPREDICTED_INTERVAL_S = 120.0  # between two matches that nothing predicts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,6 +125,14 @@ def confirm_each_other(matches: Sequence[PositionedMatch]) -> bool:
     sd_m = math.hypot(compute_worst_sd(first.scatter_m2), compute_worst_sd(last.scatter_m2))
     is_independent = last.shares_no_place_with(first) or apart_m > _MAX_INNOVATION_SIGMA * sd_m
     return is_independent or len(matches) >= _FIXES_TO_OVERRULE_TRACK
+
+
+def can_follow(before: PositionedMatch, match: PositionedMatch) -> bool:
+    """Return True if an aircraft could have flown from one match to the next, if nothing predicts them."""
+    elapsed_s = match.t_s - before.t_s
+    reach_m = _MAX_SPEED_M_S * elapsed_s + 3 * math.hypot(match.accuracy_m, before.accuracy_m)
+    away_m = math.hypot(*offset_between_m(before.position, match.position))
+    return 0 < elapsed_s <= _MAX_UNPREDICTED_INTERVAL_S and away_m <= reach_m
 
 
 def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:

@@ -6,7 +6,7 @@ The link calls it in its own thread, the loop of `flight` (through `autopilot`) 
 import math
 from dataclasses import dataclass, replace
 
-from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
@@ -16,7 +16,7 @@ from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4_INERTIAL_ERROR, AgeWatch, VelocityError
-from edgevpr.runtime.flight.consistency import Consistency, confirm_each_other
+from edgevpr.runtime.flight.consistency import Consistency, can_follow, confirm_each_other
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
@@ -47,9 +47,6 @@ _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
 # Odometry is corrected if its scale differs by more from the height of one match, or from the median of three.
 _MATCH_SCALE_TOLERANCE = 0.15
-# Two fixes that nothing predicts confirm each other if they are at most so far apart, and an aircraft could fly there.
-_MAX_UNCONFIRMED_S = 120.0
-_MAX_SPEED_M_S = 30.0
 _SCALE_TOLERANCE = 0.02
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them carry the information of one, so the claimed error is multiplied by this. Without it, they outweighed
@@ -239,8 +236,9 @@ class Navigator(Listener):
     def accuracy_m(self, now_s: float) -> float | None:
         """Return the accuracy of the position: metres, standard deviation of one axis (None: position unknown)."""
         estimate = self._navigation.estimate_state(now_s)
-        is_known = estimate is not None and self._navigation.is_confirmed
-        return self._compute_claimed_m(estimate) if estimate and is_known else None
+        if estimate is None or not self._navigation.is_confirmed:
+            return None
+        return self._compute_claimed_m(estimate)
 
     def estimate_state(self, t_s: float) -> MotionState | None:
         """Return position and motion at `t_s` for a continuous channel; None if they are not accurate enough. `t_s`
@@ -312,14 +310,9 @@ class Navigator(Listener):
     def _confirm(self, fix: Fix, match: PositionedMatch) -> Advice:
         """Advise on the fix of a match that nothing predicts: it is held back until others agree, within what can be
         flown."""
-        if self._unconfirmed:
-            before = self._unconfirmed[-1]
-            elapsed_s = match.t_s - before.t_s
-            reach_m = _MAX_SPEED_M_S * elapsed_s + 3 * math.hypot(match.accuracy_m, before.accuracy_m)
-            away_m = math.hypot(*offset_between_m(before.position, match.position))
-            if not 0 < elapsed_s <= _MAX_UNCONFIRMED_S or away_m > reach_m:
-                self._unconfirmed = []
-        self._unconfirmed = [*self._unconfirmed[-3:], match]
+        if self._unconfirmed and not can_follow(self._unconfirmed[-1], match):
+            self._unconfirmed = []
+        self._unconfirmed = [*self._unconfirmed[-3:], match]  # four are enough
         if confirm_each_other(self._unconfirmed):
             return Advice(fix)
         return Advice(None, Reason(ReasonCode.HELD_UNCONFIRMED), is_held=True)
@@ -342,7 +335,7 @@ class Navigator(Listener):
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.estimate_state(t_s)
         max_error_m = _MAX_CONTINUOUS_ERROR_M if self._channel.is_continuous else _MAX_ERROR_M
-        if estimate is None or max(estimate.accuracy_m, self._common_tilt_m) > max_error_m:
+        if estimate is None or self._compute_accuracy_m(estimate) > max_error_m:
             return None
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
@@ -373,7 +366,7 @@ class Navigator(Listener):
         autopilot_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
         error_m = float(distance_m(*autopilot_deg, position.lat_deg, position.lon_deg))
         # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by error_m**2.
-        accuracy_m = max(estimate.accuracy_m, self._common_tilt_m)
+        accuracy_m = self._compute_accuracy_m(estimate)
         if error_m**2 <= 2 * accuracy_m**2:
             figures = {"distance_m": error_m, "accuracy_m": accuracy_m}
             return Advice(None, Reason(ReasonCode.NOT_BETTER, figures))
@@ -391,6 +384,11 @@ class Navigator(Listener):
             return 1.0
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
+
+    def _compute_accuracy_m(self, estimate: NavState) -> float:
+        """Return the accuracy of an estimate: never better than a tilt of the camera allows, which the filter cannot
+        average out."""
+        return max(estimate.accuracy_m, self._common_tilt_m)
 
     def _compute_claimed_m(self, estimate: NavState) -> float:
         """Return the accuracy to claim for an estimate: never better than the error common to all fixes."""
