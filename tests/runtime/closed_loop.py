@@ -36,12 +36,12 @@ class ClosedLoop:
     """A flight of a `vehicle` of the flight controller with its `parameters`, that hovers or cruises by a velocity.
 
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
-    the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long,
-    `time_error_s` by how much frames carry too late a time, and `mount_tilt_deg` by how much the camera looks east of
-    straight down. Its messages arrive `downlink_s` late. `heading_error_deg`: of the autopilot. Gyros have the noise
-    `gyro_sd` (radians, a root second); matches show the error of the attitude where they `show_tilt`. `away_m` and
-    `error_m` are, step by step, the true distance from the target, and that of the estimate from the truth; `sent` is
-    all that is sent, with the times."""
+    the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long (its
+    changes are seen where landmarks `show_ground`), `time_error_s` by how much frames carry too late a time, and
+    `mount_tilt_deg` by how much the camera looks east of straight down. Its messages arrive `downlink_s` late.
+    `heading_error_deg`: of the autopilot. Gyros have the noise `gyro_sd` (radians, a root second); matches show the
+    error of the attitude where they `show_tilt`. `away_m` and `error_m` are, step by step, the true distance from the
+    target, and that of the estimate from the truth; `sent` is all that is sent, with the times."""
 
     def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, min_accuracy_m=1.0, **parameters):
         self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)
@@ -50,6 +50,7 @@ class ClosedLoop:
             self.controller.set(name, value)
         self.sees_motion = True
         self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
+        self.show_ground, self._last_stride_scale = False, 1.0
         self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
         self.heading_error_deg, self.gyro_sd, self.show_tilt = 0.0, 0.0, False
         self.away_m, self.error_m, self.sent, self._underway, self.downlink_s = [], [], [], [], 0.0
@@ -174,11 +175,19 @@ class ClosedLoop:
         if before is None or not self.sees_motion:
             return None
         was, from_s, tilt = before
+        last_scale, self._last_stride_scale = self._last_stride_scale, self.stride_scale
+        log_height = math.log(last_scale / self.stride_scale) if self.show_ground else 0.0
         scale = cmath.rect(self.stride_scale, -math.radians(self.heading_error_deg))
         moved_m = scale * displacement_m(was.point, truth.point)
         moved_m += HEIGHT_M * (self.brain.tilt - tilt) + self._noise(_STRIDE_SD_M)
         return OdometryStep(
-            from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100
+            from_s=from_s,
+            to_s=t_s,
+            moved_m=(moved_m.real, moved_m.imag),
+            sd_m=_STRIDE_SD_M,
+            inliers=100,
+            log_height=log_height,
+            log_height_sd=0.25 * abs(log_height),
         )
 
     def _noise(self, sd):

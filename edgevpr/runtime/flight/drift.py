@@ -27,6 +27,7 @@ _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # random change of that error in one second
+_MAX_SCALE_SD = 0.15  # a scale less certain than this is replaced by that of a match
 # Its heading then drifts too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
 # an ArduPilot plane. The rotation of a match measures it (radians: standard deviation, and the largest that is used).
 _GPS_LOSS_TURN_FACTOR = 10.0
@@ -83,11 +84,14 @@ INERTIAL_PX4 = replace(INERTIAL, heading_sd=0.15, attitude_follows_positions=Tru
 @dataclass(frozen=True, slots=True)
 class OdometryMeasurement:
     """A step of visual odometry (see `recognise.odometry`): the displacement `moved_m` (2,), its difference from
-    that of the path, `error_m` (2,), and the standard deviation `sd_m` of each axis."""
+    that of the path, `error_m` (2,), and the standard deviation `sd_m` of each axis. `log_height`: natural logarithm of
+    its scale divided by that of the last step, with the standard deviation `log_height_sd`."""
 
     moved_m: Doubles
     error_m: Doubles
     sd_m: float
+    log_height: float = 0.0
+    log_height_sd: float = 0.0
 
 
 class DriftFilter:
@@ -184,6 +188,7 @@ class DriftFilter:
         if odometry is None:
             self._begin_frame()
             return True
+        self._change_scale(odometry.log_height, odometry.log_height_sd)
         (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, _IDENTITY.copy()
         transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
         transition[_F, _HEADING] = transition[_F, _TURN]
@@ -211,8 +216,9 @@ class DriftFilter:
         self._correct(matrix, error, variance)
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
-        """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""
-        if abs(self._x[_SCALE] - error) > tolerance:
+        """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance` or is very
+        uncertain."""
+        if abs(self._x[_SCALE] - error) > tolerance or self._p[_SCALE, _SCALE] > _MAX_SCALE_SD**2:
             self._p[_SCALE] = self._p[:, _SCALE] = 0.0
             self._x[_SCALE], self._p[_SCALE, _SCALE] = error, _ODOMETRY_SD**2
 
@@ -259,6 +265,14 @@ class DriftFilter:
         matrix[:2] = self._make_position_jacobian(age_s, 0.0)
         matrix[2:, _S], matrix[2:, _B] = _EYE, -age_s * self._drift.is_inertial * _EYE
         return matrix
+
+    def _change_scale(self, log_ratio: float, sd: float) -> None:
+        """Change the scale error of odometry as the height above ground changes."""
+        ratio = math.exp(log_ratio)
+        self._x[_SCALE] = ratio * (1.0 + self._x[_SCALE]) - 1.0
+        self._p[_SCALE] *= ratio
+        self._p[:, _SCALE] *= ratio
+        self._p[_SCALE, _SCALE] += (ratio * sd) ** 2
 
     def _begin_frame(self) -> None:
         """Set `f` to the aircraft's offset when the last frame was taken."""

@@ -29,12 +29,10 @@ _MAX_PROVING_SD_M = 25.0
 _NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
 _MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
-# Between matches the ground may rise or fall, which makes the scale of odometry wrong. The zooms between successive
-# pictures add up to that change. An attitude error of two degrees adds up to a zoom of 0.1 over 300 m at a height of
-# 100 m, so a smaller zoom proves nothing. After a gap the change is unknown: 0.3 is a valley 30 m deep below 100 m.
-_ZOOM_DEAD_BAND = 0.1
-_MAX_ODOMETRY_GAP_S = 5.0
-_SCALE_SD_AFTER_GAP = 0.3
+# In a gap of odometry the ground may rise or fall, which changes its scale. In five seconds and more by 0.3: a valley
+# 30 m deep below 100 m.
+_GAP_SCALE_SD = 0.3
+_LONG_GAP_S = 5.0
 _MAX_RECEIVER_SIGMA = 5.0  # a receiver farther from our position is not used to correct it
 # A steady receiver that contradicts our position for this long is correct, unless a recent match proves our position.
 _GPS_OVERRULES_S = 2.0
@@ -74,7 +72,7 @@ class Navigation:
         self.has_gps = self.is_in_doubt = False
         self.is_confirmed = True
         self._unconfirmed: list[PositionedMatch] = []  # agree with each other; nothing else supports them
-        self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
+        self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_step_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
         self._odometry_since_fix = _OdometrySinceFix()
         self._contradicted_since_s: float | None = None
@@ -222,7 +220,15 @@ class Navigation:
         step, odometry = frame.odometry, None
         if step and before and before.t_s == step.from_s:
             moved_m = np.array(step.moved_m)
-            odometry = OdometryMeasurement(moved_m, moved_m - (point.position_m - before.position_m), step.sd_m)
+            gap_s, self._last_step_s = step.from_s - self._last_step_s, frame.t_s
+            gap_sd = _GAP_SCALE_SD * math.sqrt(min(1.0, max(0.0, gap_s) / _LONG_GAP_S)) if math.isfinite(gap_s) else 0.0
+            odometry = OdometryMeasurement(
+                moved_m=moved_m,
+                error_m=moved_m - (point.position_m - before.position_m),
+                sd_m=step.sd_m,
+                log_height=step.log_height,
+                log_height_sd=math.hypot(step.log_height_sd, gap_sd),
+            )
         is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.attitude_gain_s2, frame.sd_m, odometry)
         if step and odometry and is_used:
             self._odometry_since_fix.add(step, frame)
@@ -327,26 +333,23 @@ class Navigation:
 
 
 class _OdometrySinceFix:
-    """Visual odometry since the last fix or GPS position, at `last_fix_s`: its displacement and change of scale."""
+    """Visual odometry since the last fix or GPS position, at `last_fix_s`: its displacement, and the error of scale due
+    to contradictory heights."""
 
     def __init__(self, last_fix_s: float = -math.inf) -> None:
-        self._moved_m, self._zoom, self._last_s = np.zeros(2), 0.0, last_fix_s
-        self._has_gap, self._misses_step, self._scale_sd = False, False, 0.0
+        self._moved_m, self._last_s = np.zeros(2), last_fix_s
+        self._misses_step, self._scale_sd = False, 0.0
 
     def add(self, step: OdometryStep, frame: FrameMeasurement) -> None:
         """Add the step of odometry that led to a frame."""
-        self._has_gap |= frame.t_s - self._last_s > _MAX_ODOMETRY_GAP_S
         self._misses_step |= step.from_s > self._last_s
         self._scale_sd = max(self._scale_sd, frame.scale_sd_after_gap if self._misses_step else frame.scale_sd)
-        self._moved_m, self._zoom, self._last_s = self._moved_m + step.moved_m, self._zoom + step.zoom, frame.t_s
+        self._moved_m, self._last_s = self._moved_m + step.moved_m, frame.t_s
 
     @property
     def error_m(self) -> float:
-        """Standard deviation, of one axis, of the error due to changed terrain height, metres."""
-        gap_sd = _SCALE_SD_AFTER_GAP if self._has_gap else 0.0
-        # Height error at the last match, and the change since.
-        scale_sd = self._scale_sd + max(gap_sd, abs(self._zoom) - _ZOOM_DEAD_BAND, 0.0)
-        return float(np.hypot(*self._moved_m)) * scale_sd
+        """Standard deviation, of one axis, of the error due to contradictory heights, metres."""
+        return float(np.hypot(*self._moved_m)) * self._scale_sd
 
 
 def is_gps_aided(vehicle: Vehicle) -> bool:

@@ -85,7 +85,8 @@ class Agreement:
     `scale` (above 1 if it was taken from higher up), and shift its centre from the place's centre by `shift_share` (dx
     right, dy down), as fractions of the place's longest side. `covariance_share2` (var x, cov xy, var y) is its
     covariance. All four are None without inliers. `is_expected` is False if the landmarks agree on an overlay other
-    than the expected one. `inlier_points`: the inliers in query and place, complex (n,) each.
+    than the expected one. `inlier_points`: the inliers in query and place, complex (n,) each, and `matched_points`: all
+    landmarks that match.
     """
 
     inliers: int
@@ -97,6 +98,7 @@ class Agreement:
     covariance_share2: Covariance | None = None
     is_expected: bool = True
     inlier_points: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
+    matched_points: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
 
     @property
     def is_unshifted(self) -> bool:
@@ -160,6 +162,7 @@ def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | No
         scale=float(abs(turn_scale)),
         covariance_share2=(variance, 0.0, variance),
         inlier_points=(query_points[is_inlier], place_points[is_inlier]),
+        matched_points=(query_points, place_points),
     )
 
 

@@ -1,5 +1,6 @@
 """Navigation between fixes: with a true flight beside it, how wrong it is, and whether it knows."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight import drift
-from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL
+from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL, DriftFilter, OdometryMeasurement
 from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.recognise.odometry import OdometryStep
@@ -175,20 +176,22 @@ def test_receiver_confirms_a_start_at_a_fix():
 
 
 @pytest.mark.parametrize(
-    ("zoom", "gap_s", "least_m", "most_m"), [(0.0, 0.0, 0.0, 8.0), (0.04, 0.0, 20.0, 60.0), (0.0, 8.0, 15.0, 60.0)]
+    ("log_height", "sd", "least_m", "most_m"), [(0.0, 0.0, 4.0, 8.0), (0.0, 0.3, 25.0, 35.0), (0.3, 0.1, 10.0, 20.0)]
 )
-def test_odometry_claims_the_error_of_unknown_terrain(zoom, gap_s, least_m, most_m):
-    """A hundred metres without a match: over ground that seems flat, that falls away, and after a gap."""
-    flown = ReceiverOnly().fly(10)
-    flown.fly(gap_s, has_gps=False)
+def test_odometry_is_scaled_and_claims_the_error_of_terrain(log_height, sd, least_m, most_m):
+    """A hundred metres of strides without a match: over flat ground, after a gap, and over ground that fell away."""
+    errors = DriftFilter(INERTIAL, 1.0)
+    errors.start(1.0, 100.0)
+    errors.add_frame(0.0, 0.0, 0.2)
+    moved_m = np.array([10.0, 0.0])
     for number in range(10):
-        flown.fly(1, has_gps=False)
-        stride = OdometryStep(
-            from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom
-        )
-        flown.navigation._odometry_since_fix.add(stride, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, odometry=stride))
-        assert number or flown.navigation.estimate_state(flown.t_s)
-    assert least_m <= flown.navigation._odometry_since_fix.error_m <= most_m
+        errors.predict(1.0, np.zeros(2))
+        change, change_sd = (0.0, 0.0) if number else (log_height, sd)
+        stride = OdometryMeasurement(moved_m, moved_m, 0.2, log_height=change, log_height_sd=change_sd)
+        assert errors.add_frame(0.0, 0.0, 0.2, stride)
+    offset_m, _, covariance = errors.estimate_errors(0.0)
+    assert offset_m == pytest.approx((100 * math.exp(log_height), 0.0), abs=1.0)
+    assert least_m <= math.sqrt(covariance[0, 0]) <= most_m
 
 
 def test_navigation_by_accelerations_alone_starts_at_a_fix():

@@ -161,6 +161,26 @@ def test_px4_without_gps_or_images_gets_nothing_and_the_operator_is_informed():
     assert not flight.positions_sent(0)
 
 
+@pytest.mark.parametrize("unseen_s", [0, 1, 4])
+@pytest.mark.parametrize("scale", [1.4, 0.75])
+@pytest.mark.parametrize(
+    ("vehicle", "parameters"), [("arducopter", GPS_INPUT), ("arduplane", {}), ("px4-copter", SENSOR)]
+)
+def test_cliff_beyond_the_map_is_followed_and_where_it_is_not_seen_claimed(vehicle, parameters, scale, unseen_s):
+    """Strides are 1.4 times short beyond it: unseen, 120 to 180 m off in half a minute, 6 to 40 claimed."""
+    flight = ClosedLoop(vehicle, velocity_m_s=12j, **parameters).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(20)
+    flight.matches, flight.show_ground = False, unseen_s == 0
+    flight.sees_motion = not unseen_s
+    flight.fly(unseen_s)
+    flight.sees_motion, flight.stride_scale = True, 1 / scale
+    for _ in range(6):
+        flight.fly(5)
+        truth, state = flight.brain.truth, flight.navigator._navigation.estimate_state(1000.0 + flight.now_s)
+        away_m = distance_m(truth.lat_deg, truth.lon_deg, state.position.lat_deg, state.position.lon_deg)
+        assert away_m < (30 if flight.show_ground else max(10.0, 2.5 * state.accuracy_m))
+
+
 @pytest.mark.parametrize(("matched_s", "scale"), [(0, 1.4), (15, 1.4), (15, 0.7)])
 def test_odometry_over_other_ground_is_correct_once_matches_show_its_height(matched_s, scale):
     """Strides alone, 1.4 times short: uncorrected they lose 86 m in 20 s. Before the height is corrected, matches show

@@ -75,10 +75,23 @@ def test_odometry_is_none_if_it_cannot_be_measured(ground):
     assert measure_odometry(first, (replace(second[0], footprint_m=None), second[1])) is None
 
 
-def test_odometry_rejects_jumps_of_compass_and_height(ground):
+def test_odometry_rejects_a_jump_of_the_compass(ground):
     second = replace(START, east_m=215.0)
-    for wrong in ({"heading_deg": 50.0}, {"height_m": 70.0}):
-        assert measure_odometry(take_view(ground, START), take_view(ground, second, replace(second, **wrong))) is None
+    turned = take_view(ground, second, replace(second, heading_deg=50.0))
+    assert measure_odometry(take_view(ground, START), turned) is None
+
+
+def test_odometry_measures_a_jump_of_the_reported_height(ground):
+    strides = VisualOdometry()
+    low = [replace(START, east_m=east_m, height_m=70.0) for east_m in (215.0, 230.0)]
+    true = [replace(pose, height_m=100.0) for pose in low]
+    strides.measure(5.0, *take_view(ground, START))
+    jump = strides.measure(6.0, *take_view(ground, true[0], low[0]))
+    after = strides.measure(7.0, *take_view(ground, true[1], low[1]))
+    assert jump.moved_m == pytest.approx((15.0, 0.0), abs=0.5), "by the height before"
+    assert after.moved_m == pytest.approx((10.5, 0.0), abs=0.5)
+    assert jump.log_height == 0.0
+    assert after.log_height == pytest.approx(math.log(100 / 70), abs=0.03)
 
 
 def test_odometry_is_none_over_repetitive_or_featureless_ground():
