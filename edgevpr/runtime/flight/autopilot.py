@@ -196,10 +196,10 @@ class AutopilotOutput:
             self._navigator.trust_gps(not is_wrong or not have_agreed)
             self._navigator.distrust_map(is_wrong and not have_agreed)
 
-    def correct_height(self, ratio: float, ratio_sd: float) -> None:
-        """Set the ratio of visual height to the autopilot's height above ground (1.0: equal), and its error."""
+    def correct_height(self, ratio: float) -> None:
+        """Set the ratio of visual height to the autopilot's height above ground (1.0: equal)."""
         with self._link.take_turn("height"):
-            self._navigator.correct_height(ratio, ratio_sd)
+            self._navigator.correct_height(ratio)
 
     def reset_navigation(self) -> None:
         """Restart the navigation, because later fixes have different errors."""

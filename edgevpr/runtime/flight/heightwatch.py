@@ -15,7 +15,6 @@ MIN_CONTRADICTION_RATIO = 1.25
 MIN_CORRECTION_RATIO = 1.1  # a larger error is corrected; five matches scatter by less
 MATCHES_IN_A_ROW = 5
 _NEWEST_MATCHES = 3  # over rising or falling ground the median of all five would be two matches old
-_GROUND_CHANGE = 0.3  # further change of rising or falling ground between matches, as a fraction of the height
 
 
 class HeightWatch:
@@ -40,14 +39,6 @@ class HeightWatch:
         return statistics.median(ratios[-_NEWEST_MATCHES:]) if is_wrong else 1.0
 
     @property
-    def ratio_sd(self) -> float:
-        """Relative error of `ratio`: the deviation of the newest match, for example where the ground begins to fall or
-        rise, plus its further change. 0.0 within the scatter of matches."""
-        change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
-        is_scatter = 1 / MIN_CORRECTION_RATIO <= change <= MIN_CORRECTION_RATIO
-        return 0.0 if is_scatter else abs(change - 1.0) + _GROUND_CHANGE
-
-    @property
     def _ratios(self) -> list[float]:
         return [image_height_m / autopilot_height_m for image_height_m, autopilot_height_m in self._heights_m]
 
@@ -62,7 +53,7 @@ class HeightWatch:
         self._last_s = frame.t_mono_s
         self._heights_m.append((max(MIN_HEIGHT_M, located.height_m or 0.0), max(MIN_HEIGHT_M, vehicle.height_m or 0.0)))
         if self._autopilot:
-            self._autopilot.correct_height(self.ratio, self.ratio_sd)
+            self._autopilot.correct_height(self.ratio)
         self._judge()
 
     def _judge(self) -> None:

@@ -32,15 +32,14 @@ _MAX_HEADING_CHANGE_DEG = 45.0  # largest change of the compass error between tw
 class FrameMeasurement:
     """A frame taken at `t_s`. `sd_m`: standard deviation of its position on each axis, without the error that an
     attitude error causes through `attitude_gain_s2` (see `DriftFilter`). `odometry`: motion since the previous frame
-    (None: unknown); `scale_sd`: error of its scale, where heights contradict each other, and `scale_sd_after_gap` if a
-    step since the last match is missing. `correlation_length_m`: closer fixes of two frames have common errors."""
+    (None: unknown); `scale_sd`: error of its scale, where heights contradict each other. `correlation_length_m`: closer
+    fixes of two frames have common errors."""
 
     t_s: float
     sd_m: float
     attitude_gain_s2: float = 0.0
     odometry: OdometryStep | None = None
     scale_sd: float = 0.0
-    scale_sd_after_gap: float = 0.0
     correlation_length_m: float = 0.0
 
 
@@ -81,10 +80,10 @@ class PositionedMatch:
 
 
 def measure_frame(
-    event: Recognition, vehicle: Vehicle | None, *, is_level: bool, height_ratio: float, height_ratio_sd: float
+    event: Recognition, vehicle: Vehicle | None, *, is_level: bool, height_ratio: float, height_doubt: float
 ) -> FrameMeasurement | None:
     """Return the measurement of an event's frame; None if the frame could not be read. `is_level`: the camera is
-    on a gimbal; `height_ratio`: visual height divided by the reported one, with the relative error `height_ratio_sd`.
+    on a gimbal; `height_ratio`: visual height divided by the reported one, whose relative error is `height_doubt`.
 
     An attitude error does not affect a camera on a gimbal, nor a picture for which no attitude was used. A time error
     shifts the nadir by the aircraft's motion and roll.
@@ -105,8 +104,7 @@ def measure_frame(
         sd_m=sd_m,
         attitude_gain_s2=0.0 if is_unaffected else height_m / GRAVITY_M_S2,
         odometry=event.odometry,
-        scale_sd=height_ratio * height_ratio_sd,
-        scale_sd_after_gap=height_ratio * max(abs(height_ratio - 1.0), height_ratio_sd),
+        scale_sd=height_ratio * height_doubt,
         correlation_length_m=_CORRELATION_LENGTH * (event.view.footprint_m or 0.0),
     )
 

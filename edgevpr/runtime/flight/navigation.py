@@ -192,7 +192,7 @@ class Navigation:
         return True
 
     def _record_gps(self, now_s: float) -> None:
-        self.last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix(now_s)
+        self.last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix()
         self.is_confirmed = True
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
@@ -263,7 +263,7 @@ class Navigation:
             if match.heading_error_deg is not None:
                 self._filter.correct_by_rotation(math.radians(match.heading_error_deg))
             self.last_fix_s = max(self.last_fix_s, match.t_s)
-            self._odometry_since_fix = _OdometrySinceFix(self.last_fix_s)
+            self._odometry_since_fix = _OdometrySinceFix()
 
     def _judge_support(self, fix: PredictedFix, verdict: GateResult) -> None:
         """Update `is_confirmed` with an accepted fix."""
@@ -333,18 +333,15 @@ class Navigation:
 
 
 class _OdometrySinceFix:
-    """Visual odometry since the last fix or GPS position, at `last_fix_s`: its displacement, and the error of scale due
-    to contradictory heights."""
+    """Visual odometry since the last fix or GPS position: its displacement, and the error of scale due to contradictory
+    heights."""
 
-    def __init__(self, last_fix_s: float = -math.inf) -> None:
-        self._moved_m, self._last_s = np.zeros(2), last_fix_s
-        self._misses_step, self._scale_sd = False, 0.0
+    def __init__(self) -> None:
+        self._moved_m, self._scale_sd = np.zeros(2), 0.0
 
     def add(self, step: OdometryStep, frame: FrameMeasurement) -> None:
         """Add the step of odometry that led to a frame."""
-        self._misses_step |= step.from_s > self._last_s
-        self._scale_sd = max(self._scale_sd, frame.scale_sd_after_gap if self._misses_step else frame.scale_sd)
-        self._moved_m, self._last_s = self._moved_m + step.moved_m, frame.t_s
+        self._moved_m, self._scale_sd = self._moved_m + step.moved_m, max(self._scale_sd, frame.scale_sd)
 
     @property
     def error_m(self) -> float:

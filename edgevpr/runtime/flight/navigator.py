@@ -96,7 +96,7 @@ class Navigator(Listener):
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch = OutputWatch()
         self._unconfirmed: list[PositionedMatch] = []  # successive matches that nothing predicted
-        self._height_ratio, self._height_ratio_sd = 1.0, 0.0
+        self._height_ratio = 1.0
         self._resolved_doubt_m = self._resolved_step_m = 0.0  # differences of height that matches have resolved
         # Standard deviation of the error common to the last fixes, and its part that is due to a tilt of the camera.
         self._shared_sd_m, self._common_tilt_m = map_sd_m, 0.0
@@ -118,14 +118,12 @@ class Navigator(Listener):
     def trusts_gps(self) -> bool:
         return self._trusts_gps
 
-    def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
+    def correct_height(self, ratio: float) -> None:
         """Set the ratio of visual height to the autopilot's height above ground (1.0: about equal). Odometry is scaled
-        by it. `ratio_sd` is its relative error. Where pictures miss a step, the ground may have changed back unnoticed:
-        then the claimed error contains the deviation from 1.0, if that is larger. Pictures also
-        resolve the contradictions between the sources of the autopilot's height so far."""
+        by it, and contradictions between the sources of the autopilot's height so far are resolved."""
         if ratio != 1.0:
             self._navigation.restart_odometry_scale(ratio - 1.0, _SCALE_TOLERANCE)
-        self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
+        self._height_ratio = ratio
         if self._vehicle:
             self._resolved_doubt_m = self._vehicle.height_doubt_m
             self._resolved_step_m = self._vehicle.height_step_m
@@ -325,12 +323,12 @@ class Navigator(Listener):
 
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
-        ratio, ratio_sd = self._height_ratio, self._height_ratio_sd
+        doubt = 0.0
         if vehicle and vehicle.height_m and vehicle.height_m > 0:
             step_m = abs(vehicle.height_step_m - self._resolved_step_m)
-            doubt_m = max(vehicle.height_doubt_m - self._resolved_doubt_m, step_m)
-            ratio_sd = math.hypot(ratio_sd, doubt_m / vehicle.height_m)
-        return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_ratio_sd=ratio_sd)
+            doubt = max(vehicle.height_doubt_m - self._resolved_doubt_m, step_m) / vehicle.height_m
+        ratio = self._height_ratio
+        return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_doubt=doubt)
 
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.estimate_state(t_s)

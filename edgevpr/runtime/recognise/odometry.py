@@ -10,9 +10,9 @@ from typing import Any
 
 from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.agreement import measure_agreement
+from edgevpr.runtime.recognise.agreement import Agreement, measure_agreement
 from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, Landmarks
-from edgevpr.runtime.recognise.parallax import ParallaxChain
+from edgevpr.runtime.recognise.parallax import NO_CHANGE, HeightChange, ParallaxChain, Shift, claim_unseen_change
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
 _MIN_INLIERS = 30
@@ -20,6 +20,7 @@ _MIN_INLIER_RATIO = 0.4
 _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictures
 _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
+_MIN_KEY_SHIFT = 0.1  # fraction of the longest side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,48 +47,81 @@ class OdometryStep:
         return {"from_s": self.from_s, "moved_m": moved_m, **figures, **heights}
 
 
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    t_s: float
+    view: View
+    landmarks: Landmarks
+
+
 class VisualOdometry:
-    """Measures the motion from each frame to the next."""
+    """Measures the motion from each frame to the next, and how the height above ground changes."""
 
     def __init__(self) -> None:
-        self._previous: tuple[float, View, Landmarks] | None = None
-        self._chain = ParallaxChain()
+        self._previous: _Picture | None = None
+        # The height is followed from key picture to key picture: between two frames of a slow flight, landmarks shift
+        # too little to show their depth.
+        self._key: _Picture | None = None
+        self._since_key = 0j  # moved since then, as a fraction of the picture's longest side: east + 1j * north
+        self._chain, self._climb = ParallaxChain(), NO_CHANGE
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
-        last, self._previous = self._previous, (t_s, view, landmarks.select_best(PLACE_LANDMARKS))
-        chain, self._chain = self._chain, ParallaxChain()  # it breaks unless this step can be measured
-        if last is None or not 0 < t_s - last[0] <= _MAX_ELAPSED_S:
+        last, self._previous = self._previous, _Picture(t_s, view, landmarks)
+        found = _compare(last, self._previous) if last and 0 < t_s - last.t_s <= _MAX_ELAPSED_S else None
+        if last is None or found is None:
+            self._key, self._since_key = self._previous, 0j
+            self._chain, self._climb = ParallaxChain(), NO_CHANGE
             return None
-        from_s, start, previous = last
-        if start.nadir_offset is None or view.nadir_offset is None or start.up_deg is None or view.up_deg is None:
-            return None
-        if start.footprint_m is None or view.footprint_m is None:
-            return None
-        agreement = measure_agreement(landmarks, previous)
-        if agreement.inliers < max(_MIN_INLIERS, _MIN_INLIER_RATIO * agreement.matched):
-            return None
-        matched = agreement.matched_points
-        if agreement.shift_share is None or agreement.rotation_deg is None or agreement.scale is None or not matched:
-            return None
-        rotation_deg = wrap_deg(agreement.rotation_deg - (view.up_deg - start.up_deg))
-        start_m, footprint_m = start.footprint_m / start.height_scale, view.footprint_m / view.height_scale
-        scale = agreement.scale * start_m / footprint_m
-        if abs(rotation_deg) > _MAX_TURN_DEG or not 1 / _MAX_SCALE < scale < _MAX_SCALE:
-            return None
-        # The point below the camera in the previous picture is that of this picture, rotated, scaled and shifted.
-        factor = agreement.scale * complex(math.cos(turn := math.radians(agreement.rotation_deg)), math.sin(turn))
-        nadir, start_nadir = (complex(offset[0], -offset[1]) for offset in (view.nadir_offset, start.nadir_offset))
-        step = factor * nadir + complex(*agreement.shift_share) - start_nadir
-        height = chain.add_step(matched, (nadir, start_nadir), factor, step, footprint_m / start_m)
-        self._chain = chain
-        east_m, north_m = start_m * picture_axes(start.up_deg) @ (step.real, -step.imag)
+        shift, agreement = found
+        start, start_m = last.view, (last.view.footprint_m or 0.0) / last.view.height_scale
+        east, north = picture_axes(start.up_deg or 0.0) @ (shift.offset.real, -shift.offset.imag)
+        self._since_key += complex(east, north)
+        climb, self._climb = self._climb, NO_CHANGE  # up to the start of this step
+        height = self._follow_height(last, self._previous, shift)
         return OdometryStep(
-            from_s=from_s,
+            from_s=last.t_s,
             to_s=t_s,
-            moved_m=(float(east_m), float(north_m)),
+            moved_m=(start_m * float(east), start_m * float(north)),
             sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
-            log_height=height.log_ratio,
-            log_height_sd=height.sd,
+            log_height=height.log_ratio + climb.log_ratio,
+            log_height_sd=math.hypot(height.sd, climb.sd),
         )
+
+    def _follow_height(self, last: _Picture, now: _Picture, shift: Shift) -> HeightChange:
+        """Return the change of height above ground if the aircraft has moved far enough since the key picture."""
+        share, key = abs(self._since_key), self._key
+        if share < _MIN_KEY_SHIFT:
+            return NO_CHANGE
+        found = (shift,) if key is last else key and _compare(key, now)
+        self._key, self._since_key = now, 0j
+        if found and abs(found[0].offset) >= _MIN_KEY_SHIFT / 2:
+            change, self._climb = self._chain.add(found[0])
+            return change
+        self._chain = ParallaxChain()
+        return claim_unseen_change(share)
+
+
+def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:
+    """Return the motion between two pictures; None if it cannot be measured."""
+    one, other = start.view, now.view
+    if one.nadir_offset is None or other.nadir_offset is None or one.up_deg is None or other.up_deg is None:
+        return None
+    if one.footprint_m is None or other.footprint_m is None:
+        return None
+    agreement = measure_agreement(now.landmarks, start.landmarks.select_best(PLACE_LANDMARKS))
+    if agreement.inliers < max(_MIN_INLIERS, _MIN_INLIER_RATIO * agreement.matched):
+        return None
+    pairs, rotation_deg, share = agreement.matched_points, agreement.rotation_deg, agreement.shift_share
+    if pairs is None or rotation_deg is None or share is None or agreement.scale is None:
+        return None
+    expected_scale = other.footprint_m / other.height_scale * one.height_scale / one.footprint_m
+    turned_deg = wrap_deg(rotation_deg - (other.up_deg - one.up_deg))
+    if abs(turned_deg) > _MAX_TURN_DEG or abs(math.log(agreement.scale / expected_scale)) > math.log(_MAX_SCALE):
+        return None
+    factor = agreement.scale * complex(math.cos(turn := math.radians(rotation_deg)), math.sin(turn))
+    nadir, start_nadir = (complex(offset[0], -offset[1]) for offset in (other.nadir_offset, one.nadir_offset))
+    # The point below the camera in the start picture is that of this picture, rotated, scaled and shifted.
+    offset = factor * nadir + complex(*share) - start_nadir
+    return Shift(*pairs, nadir, start_nadir, factor, offset, expected_scale), agreement

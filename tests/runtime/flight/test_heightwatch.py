@@ -53,16 +53,6 @@ def test_height_watch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
     ]
 
 
-def test_ratio_sd_is_the_deviation_of_the_newest_match(watch):
-    assert watch.watch.ratio_sd == 0.0
-    watch.update(101, 99, 108)
-    assert watch.watch.ratio_sd == 0.0, "matches scatter by as much"
-    watch.update(141)
-    assert (watch.watch.ratio, watch.watch.ratio_sd) == (1.0, pytest.approx(0.71))
-    watch.update(*[141] * 4)
-    assert (watch.watch.ratio, watch.watch.ratio_sd) == (pytest.approx(1.41), 0.0)
-
-
 def test_height_watch_accepts_a_reported_height_of_zero(watch):
     assert watch.update(*[100] * 5, reported_m=0.0) == [
         format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=1.0, image_height_m=100.0)
