@@ -27,7 +27,6 @@ _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # random change of that error in one second
-_MAX_SCALE_SD = 0.15  # a scale less certain than this is replaced by that of a match
 # Its heading then drifts too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
 # an ArduPilot plane. The rotation of a match measures it (radians: standard deviation, and the largest that is used).
 _GPS_LOSS_TURN_FACTOR = 10.0
@@ -216,9 +215,8 @@ class DriftFilter:
         self._correct(matrix, error, variance)
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
-        """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance` or is very
-        uncertain."""
-        if abs(self._x[_SCALE] - error) > tolerance or self._p[_SCALE, _SCALE] > _MAX_SCALE_SD**2:
+        """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""
+        if abs(self._x[_SCALE] - error) > tolerance:
             self._p[_SCALE] = self._p[:, _SCALE] = 0.0
             self._x[_SCALE], self._p[_SCALE, _SCALE] = error, _ODOMETRY_SD**2
 

@@ -15,7 +15,7 @@ from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurem
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import compute_worst_sd, mahalanobis
-from edgevpr.runtime.recognise.odometry import OdometryStep
+from edgevpr.runtime.recognise.parallax import claim_unseen_change
 
 _GPS_INTERVAL_S = 1.0
 # GPS errors are correlated from one second to the next, so the standard deviation is multiplied by this.
@@ -29,10 +29,7 @@ _MAX_PROVING_SD_M = 25.0
 _NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
 _MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
-# In a gap of odometry the ground may rise or fall, which changes its scale. In five seconds and more by 0.3: a valley
-# 30 m deep below 100 m.
-_GAP_SCALE_SD = 0.3
-_LONG_GAP_S = 5.0
+_LONG_GAP_S = 5.0  # of odometry: any change of the ground is possible
 _MAX_RECEIVER_SIGMA = 5.0  # a receiver farther from our position is not used to correct it
 # A steady receiver that contradicts our position for this long is correct, unless a recent match proves our position.
 _GPS_OVERRULES_S = 2.0
@@ -72,9 +69,9 @@ class Navigation:
         self.has_gps = self.is_in_doubt = False
         self.is_confirmed = True
         self._unconfirmed: list[PositionedMatch] = []  # agree with each other; nothing else supports them
-        self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_step_s = self._last_query_s = -math.inf
-        self._query_interval_s = math.inf
-        self._odometry_since_fix = _OdometrySinceFix()
+        self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
+        self._query_interval_s = self._last_step_s = math.inf
+        self._height_doubt_sd = 0.0  # error of the scale of odometry that is claimed because heights contradict
         self._contradicted_since_s: float | None = None
 
     @property
@@ -192,8 +189,7 @@ class Navigation:
         return True
 
     def _record_gps(self, now_s: float) -> None:
-        self.last_gps_s, self._odometry_since_fix = now_s, _OdometrySinceFix()
-        self.is_confirmed = True
+        self.last_gps_s, self.is_confirmed = now_s, True
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         self._filter.restart_odometry_scale(error, tolerance)
@@ -220,18 +216,14 @@ class Navigation:
         step, odometry = frame.odometry, None
         if step and before and before.t_s == step.from_s:
             moved_m = np.array(step.moved_m)
+            error_m = moved_m - (point.position_m - before.position_m)
             gap_s, self._last_step_s = step.from_s - self._last_step_s, frame.t_s
-            gap_sd = _GAP_SCALE_SD * math.sqrt(min(1.0, max(0.0, gap_s) / _LONG_GAP_S)) if math.isfinite(gap_s) else 0.0
-            odometry = OdometryMeasurement(
-                moved_m=moved_m,
-                error_m=moved_m - (point.position_m - before.position_m),
-                sd_m=step.sd_m,
-                log_height=step.log_height,
-                log_height_sd=math.hypot(step.log_height_sd, gap_sd),
-            )
+            doubt_sd = math.sqrt(max(0.0, frame.scale_sd**2 - self._height_doubt_sd**2))
+            self._height_doubt_sd = frame.scale_sd
+            height_sd = math.hypot(step.log_height_sd, claim_unseen_change(gap_s / _LONG_GAP_S).sd, doubt_sd)
+            odometry = OdometryMeasurement(moved_m, error_m, step.sd_m, step.log_height, height_sd)
         is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.attitude_gain_s2, frame.sd_m, odometry)
-        if step and odometry and is_used:
-            self._odometry_since_fix.add(step, frame)
+        if odometry and is_used:
             self._last_odometry_s = frame.t_s
 
     def predict_fix(self, match: PositionedMatch) -> PredictedFix | None:
@@ -263,7 +255,6 @@ class Navigation:
             if match.heading_error_deg is not None:
                 self._filter.correct_by_rotation(math.radians(match.heading_error_deg))
             self.last_fix_s = max(self.last_fix_s, match.t_s)
-            self._odometry_since_fix = _OdometrySinceFix()
 
     def _judge_support(self, fix: PredictedFix, verdict: GateResult) -> None:
         """Update `is_confirmed` with an accepted fix."""
@@ -313,7 +304,7 @@ class Navigation:
             t_s=t_s,
             position=move_position(path.origin, *position_m.tolist()),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
-            accuracy_m=math.hypot(compute_worst_sd(covariance[:2, :2]), self._odometry_since_fix.error_m),
+            accuracy_m=compute_worst_sd(covariance[:2, :2]),
             speed_accuracy_m_s=compute_worst_sd(covariance[2:, 2:]),
         )
 
@@ -330,23 +321,6 @@ class Navigation:
     @property
     def _valid_path(self) -> Path | None:
         return self._path if self._path and not self._path.is_broken else None
-
-
-class _OdometrySinceFix:
-    """Visual odometry since the last fix or GPS position: its displacement, and the error of scale due to contradictory
-    heights."""
-
-    def __init__(self) -> None:
-        self._moved_m, self._scale_sd = np.zeros(2), 0.0
-
-    def add(self, step: OdometryStep, frame: FrameMeasurement) -> None:
-        """Add the step of odometry that led to a frame."""
-        self._moved_m, self._scale_sd = self._moved_m + step.moved_m, max(self._scale_sd, frame.scale_sd)
-
-    @property
-    def error_m(self) -> float:
-        """Standard deviation, of one axis, of the error due to contradictory heights, metres."""
-        return float(np.hypot(*self._moved_m)) * self._scale_sd
 
 
 def is_gps_aided(vehicle: Vehicle) -> bool:

@@ -85,8 +85,7 @@ class Agreement:
     `scale` (above 1 if it was taken from higher up), and shift its centre from the place's centre by `shift_share` (dx
     right, dy down), as fractions of the place's longest side. `covariance_share2` (var x, cov xy, var y) is its
     covariance. All four are None without inliers. `is_expected` is False if the landmarks agree on an overlay other
-    than the expected one. `inlier_points`: the inliers in query and place, complex (n,) each, and `matched_points`: all
-    landmarks that match.
+    than the expected one. `inlier_points`: the inliers in query and place, complex (n,) each (`matched_points`: all).
     """
 
     inliers: int

@@ -12,7 +12,7 @@ from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import Agreement, measure_agreement
 from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, Landmarks
-from edgevpr.runtime.recognise.parallax import NO_CHANGE, HeightChange, ParallaxChain, Shift, claim_unseen_change
+from edgevpr.runtime.recognise.parallax import UNSEEN_SHIFT, HeightChange, ParallaxChain, Shift, claim_unseen_change
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
 _MIN_INLIERS = 30
@@ -27,9 +27,8 @@ _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
 class OdometryStep:
     """Motion from the frame at `from_s` to that at `to_s`: `moved_m` (east, north), correct if the reported heading and
     height are. `sd_m` is the standard deviation of each axis from the landmarks alone, of which `inliers` agree.
-    `log_height`: natural logarithm of the ratio of the height above ground at this step to that at the step before,
-    beyond what the reported heights explain, with the standard deviation `log_height_sd`: 0 over flat ground, positive
-    over ground that falls away."""
+    `log_height`: natural logarithm of the height above ground divided by that at the step before, beyond what the
+    reported heights explain (positive over ground that falls away), with the standard deviation `log_height_sd`."""
 
     from_s: float
     to_s: float
@@ -41,10 +40,9 @@ class OdometryStep:
 
     def fields(self) -> dict[str, Any]:
         """Return this step as fields of the flight log."""
-        moved_m = [round(axis_m, 2) for axis_m in self.moved_m]
-        figures = {"sd_m": round(self.sd_m, 3), "inliers": self.inliers}
+        moved = {"moved_m": [round(axis_m, 2) for axis_m in self.moved_m], "sd_m": round(self.sd_m, 3)}
         heights = {"log_height": round(self.log_height, 4), "log_height_sd": round(self.log_height_sd, 4)}
-        return {"from_s": self.from_s, "moved_m": moved_m, **figures, **heights}
+        return {"from_s": self.from_s, **moved, "inliers": self.inliers, **heights}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +57,10 @@ class VisualOdometry:
 
     def __init__(self) -> None:
         self._previous: _Picture | None = None
-        # The height is followed from key picture to key picture: between two frames of a slow flight, landmarks shift
-        # too little to show their depth.
+        # Depths are compared in key pictures: between frames of a slow flight, landmarks shift too little to show them.
         self._key: _Picture | None = None
         self._since_key = 0j  # moved since then, as a fraction of the picture's longest side: east + 1j * north
-        self._chain, self._climb = ParallaxChain(), NO_CHANGE
+        self._chain, self._climb = ParallaxChain(), HeightChange()
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
@@ -71,13 +68,13 @@ class VisualOdometry:
         found = _compare(last, self._previous) if last and 0 < t_s - last.t_s <= _MAX_ELAPSED_S else None
         if last is None or found is None:
             self._key, self._since_key = self._previous, 0j
-            self._chain, self._climb = ParallaxChain(), NO_CHANGE
+            self._chain, self._climb = ParallaxChain(), HeightChange()
             return None
         shift, agreement = found
         start, start_m = last.view, (last.view.footprint_m or 0.0) / last.view.height_scale
         east, north = picture_axes(start.up_deg or 0.0) @ (shift.offset.real, -shift.offset.imag)
         self._since_key += complex(east, north)
-        climb, self._climb = self._climb, NO_CHANGE  # up to the start of this step
+        climb, self._climb = self._climb, HeightChange()  # up to the start of this step
         height = self._follow_height(last, self._previous, shift)
         return OdometryStep(
             from_s=last.t_s,
@@ -93,14 +90,14 @@ class VisualOdometry:
         """Return the change of height above ground if the aircraft has moved far enough since the key picture."""
         share, key = abs(self._since_key), self._key
         if share < _MIN_KEY_SHIFT:
-            return NO_CHANGE
+            return HeightChange()
         found = (shift,) if key is last else key and _compare(key, now)
         self._key, self._since_key = now, 0j
         if found and abs(found[0].offset) >= _MIN_KEY_SHIFT / 2:
             change, self._climb = self._chain.add(found[0])
             return change
         self._chain = ParallaxChain()
-        return claim_unseen_change(share)
+        return claim_unseen_change(share / UNSEEN_SHIFT)
 
 
 def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:
@@ -124,4 +121,4 @@ def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:
     nadir, start_nadir = (complex(offset[0], -offset[1]) for offset in (other.nadir_offset, one.nadir_offset))
     # The point below the camera in the start picture is that of this picture, rotated, scaled and shifted.
     offset = factor * nadir + complex(*share) - start_nadir
-    return Shift(*pairs, nadir, start_nadir, factor, offset, expected_scale), agreement
+    return Shift(pairs, (nadir, start_nadir), factor, offset, expected_scale), agreement

@@ -1,14 +1,14 @@
 """Measures how the height above ground changes between steps of visual odometry, by the parallax of landmarks.
 
-A step over ground that lies a third lower looks like one a quarter shorter. But a landmark keeps its depth below the
-camera as long as it is in view: between two pictures it shifts by the camera's motion divided by this depth. If the
-landmarks below the camera shifted less than others in the last step, and as much as they do in this one, the ground
-here is lower. A fit to the whole picture cannot show that: at a cliff it follows the larger part, and over a slope its
-scale changes in the wrong direction.
+A step over ground that lies a third lower looks a quarter shorter. But in view, a landmark keeps its depth below the
+camera: between two pictures it shifts by the camera's motion divided by this depth. If the landmarks below the camera
+shifted less than others in the last step, and as much as they do in this one, the ground here is lower. A fit to the
+whole picture does not show it: at a cliff it follows the larger part, and on a slope its scale changes the wrong way.
 """
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,41 +23,34 @@ _PIXEL = 0.002  # fraction of the longest side
 _CHANGE_SD = 0.25
 _DEPENDENT_LANDMARKS = 5.0
 _SCALE_SD = 0.01  # by how much the scale across the motion is expected to differ from that of the whole picture
-# Standard deviation of a change that is not seen, over half a picture: a valley 30 m deep below 100 m.
-_UNSEEN_SD = 0.3
-_UNSEEN_SHIFT = 0.5
+_UNSEEN_SD = 0.3  # of a change that is not seen: a valley 30 m deep below 100 m
+UNSEEN_SHIFT = 0.5  # fraction of the longest side over which any change is possible
 
 
-@dataclass(frozen=True, slots=True)
-class HeightChange:
+class HeightChange(NamedTuple):
     """Natural logarithm of the ratio of two heights above ground, and its standard deviation."""
 
-    log_ratio: float
-    sd: float
-
-
-NO_CHANGE = HeightChange(0.0, 0.0)
+    log_ratio: float = 0.0
+    sd: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """The motion between two pictures. `points`, `start_points`: matching landmarks, complex (n,) each, fractions of
-    the longest side as in `agreement`; `nadir`, `start_nadir`: the points below the camera. By the landmarks, the
-    picture is rotated and scaled by `factor`, and its nadir lies `offset` from that of the start; `scale`: by the
-    reported heights."""
+    """The motion between two pictures, the new one first. `pairs`: matching landmarks, complex (n,) each, fractions of
+    the longest side as in `agreement`; `nadirs`: the points below the camera. By the landmarks, the picture is rotated
+    and scaled by `factor`, and its nadir lies `offset` from the other; `scale`: by the reported heights."""
 
-    points: Array
-    start_points: Array
-    nadir: complex
-    start_nadir: complex
+    pairs: tuple[Array, Array]
+    nadirs: tuple[complex, complex]
     factor: complex
     offset: complex
     scale: float
 
 
-def claim_unseen_change(share: float) -> HeightChange:
-    """Return the change of height to assume over ground that was not seen: this `share` of a picture's longest side."""
-    return HeightChange(0.0, _UNSEEN_SD * math.sqrt(min(1.0, share / _UNSEEN_SHIFT)))
+def claim_unseen_change(part: float) -> HeightChange:
+    """Return the change of height to claim where nothing shows it: over this `part` of the ground or time that allows
+    any change."""
+    return HeightChange(sd=_UNSEEN_SD * math.sqrt(min(1.0, max(0.0, part))))
 
 
 class ParallaxChain:
@@ -72,21 +65,19 @@ class ParallaxChain:
         divided by its depth. A tilt that is not told changes both, by opposite amounts."""
         length, turn = abs(shift.offset), shift.factor / abs(shift.factor)
         axis = shift.offset / length
-        points = turn * (shift.points - shift.nadir) / axis
-        start = (shift.start_points - shift.start_nadir) / axis
+        points = turn * (shift.pairs[0] - shift.nadirs[0]) / axis
+        start = (shift.pairs[1] - shift.nadirs[1]) / axis
         zoom, zoom_sd = _fit_scale(points, start, abs(shift.factor))
         moved = start - zoom * points
-        is_plausible = np.abs(moved.imag) <= _TOLERANCE
-        is_plausible &= np.abs(moved.real - length) <= (_MAX_NEARNESS - 1) * length
-        is_plausible &= moved.real >= _MIN_NEARNESS * length
-        now, last = shift.points[is_plausible], self._last
-        nearness = moved.real[is_plausible] / length
-        self._last = now, nearness
+        nearness = moved.real / length
+        is_plausible = (np.abs(moved.imag) <= _TOLERANCE) & (nearness >= _MIN_NEARNESS) & (nearness <= _MAX_NEARNESS)
+        now, before, nearness = (each[is_plausible] for each in (*shift.pairs, nearness))
+        last, self._last = self._last, (now, nearness)
         log_zoom = math.log(zoom / shift.scale)
         climb = HeightChange(log_zoom, math.hypot(zoom_sd / zoom, _CHANGE_SD * log_zoom))
         if last is None:
-            return NO_CHANGE, climb
-        _, here, there = np.intersect1d(shift.start_points[is_plausible], last[0], return_indices=True)
+            return HeightChange(), climb
+        _, here, there = np.intersect1d(before, last[0], return_indices=True)
         return _compare(last[1][there], nearness[here], length), climb
 
 
@@ -114,7 +105,7 @@ def _compare(before: Doubles, now: Doubles, length: float) -> HeightChange:
     """Return the change of height that landmarks show by their nearness, (n,), in two shifts."""
     ratios = np.log(now / before)
     if len(ratios) < _MIN_LANDMARKS:
-        return claim_unseen_change(length)
+        return claim_unseen_change(length / UNSEEN_SHIFT)
     # Their positions are whole pixels, so the median would not see a change of less than one.
     middle = float(np.median(ratios))
     spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length)

@@ -110,7 +110,7 @@ def test_landmarks_in_a_narrow_band_show_no_climb(ground):
     chain, log_heights, sds = ParallaxChain(), [], []
     for number in range(40):
         noise = np.random.default_rng(number).normal(0, 0.0015, (2, 150))
-        shift = Shift(start - 0.1 + noise[0] + 1j * noise[1], start, 0j, 0j, 1.0 + 0j, 0.1 + 0j, 1.0)
+        shift = Shift((start - 0.1 + noise[0] + 1j * noise[1], start), (0j, 0j), 1 + 0j, 0.1 + 0j, 1.0)
         _, climb = chain.add(shift)
         log_heights.append(climb.log_ratio)
         sds.append(climb.sd)
