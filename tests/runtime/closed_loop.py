@@ -21,6 +21,7 @@ from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.odometry import OdometryStep
+from edgevpr.runtime.recognise.parallax import claim_unseen_change
 from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -50,7 +51,7 @@ class ClosedLoop:
             self.controller.set(name, value)
         self.sees_motion = True
         self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
-        self.show_ground, self._last_stride_scale = False, 1.0
+        self.show_ground, self._last_stride_scale, self._missed_m = False, 1.0, 0.0
         self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
         self.heading_error_deg, self.gyro_sd, self.show_tilt = 0.0, 0.0, False
         self.away_m, self.error_m, self.sent, self._underway, self.downlink_s = [], [], [], [], 0.0
@@ -172,9 +173,13 @@ class ClosedLoop:
 
     def _measure_odometry(self, truth, t_s):
         before, self._last_frame = self._last_frame, (truth, t_s, self.brain.tilt)
-        if before is None or not self.sees_motion:
+        if before is None:
+            return None
+        if not self.sees_motion:
+            self._missed_m += abs(displacement_m(before[0].point, truth.point))
             return None
         was, from_s, tilt = before
+        missed_m, self._missed_m = self._missed_m, 0.0
         last_scale, self._last_stride_scale = self._last_stride_scale, self.stride_scale
         log_height = math.log(last_scale / self.stride_scale) if self.show_ground else 0.0
         scale = cmath.rect(self.stride_scale, -math.radians(self.heading_error_deg))
@@ -187,7 +192,7 @@ class ClosedLoop:
             sd_m=_STRIDE_SD_M,
             inliers=100,
             log_height=log_height,
-            log_height_sd=0.25 * abs(log_height),
+            log_height_sd=math.hypot(0.25 * log_height, claim_unseen_change(missed_m / HEIGHT_M).sd),
         )
 
     def _noise(self, sd):

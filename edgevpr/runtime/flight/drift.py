@@ -187,7 +187,11 @@ class DriftFilter:
         if odometry is None:
             self._begin_frame()
             return True
-        self._change_scale(odometry.log_height, odometry.log_height_sd)
+        ratio = math.exp(odometry.log_height)
+        self._x[_SCALE] = ratio * (1.0 + self._x[_SCALE]) - 1.0
+        self._p[_SCALE] *= ratio
+        self._p[:, _SCALE] *= ratio
+        self._p[_SCALE, _SCALE] += (ratio * odometry.log_height_sd) ** 2
         (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, _IDENTITY.copy()
         transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
         transition[_F, _HEADING] = transition[_F, _TURN]
@@ -263,14 +267,6 @@ class DriftFilter:
         matrix[:2] = self._make_position_jacobian(age_s, 0.0)
         matrix[2:, _S], matrix[2:, _B] = _EYE, -age_s * self._drift.is_inertial * _EYE
         return matrix
-
-    def _change_scale(self, log_ratio: float, sd: float) -> None:
-        """Change the scale error of odometry as the height above ground changes."""
-        ratio = math.exp(log_ratio)
-        self._x[_SCALE] = ratio * (1.0 + self._x[_SCALE]) - 1.0
-        self._p[_SCALE] *= ratio
-        self._p[:, _SCALE] *= ratio
-        self._p[_SCALE, _SCALE] += (ratio * sd) ** 2
 
     def _begin_frame(self) -> None:
         """Set `f` to the aircraft's offset when the last frame was taken."""

@@ -15,7 +15,6 @@ from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurem
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import compute_worst_sd, mahalanobis
-from edgevpr.runtime.recognise.parallax import claim_unseen_change
 
 _GPS_INTERVAL_S = 1.0
 # GPS errors are correlated from one second to the next, so the standard deviation is multiplied by this.
@@ -29,7 +28,6 @@ _MAX_PROVING_SD_M = 25.0
 _NOWHERE = Position(0.0, 0.0)  # origin of a path whose position is unknown
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
 _MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
-_LONG_GAP_S = 5.0  # of odometry: any change of the ground is possible
 _MAX_RECEIVER_SIGMA = 5.0  # a receiver farther from our position is not used to correct it
 # A steady receiver that contradicts our position for this long is correct, unless a recent match proves our position.
 _GPS_OVERRULES_S = 2.0
@@ -70,7 +68,7 @@ class Navigation:
         self.is_confirmed = True
         self._unconfirmed: list[PositionedMatch] = []  # agree with each other; nothing else supports them
         self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
-        self._query_interval_s = self._last_step_s = math.inf
+        self._query_interval_s = math.inf
         self._height_doubt_sd = 0.0  # error of the scale of odometry that is claimed because heights contradict
         self._contradicted_since_s: float | None = None
 
@@ -217,10 +215,9 @@ class Navigation:
         if step and before and before.t_s == step.from_s:
             moved_m = np.array(step.moved_m)
             error_m = moved_m - (point.position_m - before.position_m)
-            gap_s, self._last_step_s = step.from_s - self._last_step_s, frame.t_s
-            doubt_sd = math.sqrt(max(0.0, frame.scale_sd**2 - self._height_doubt_sd**2))
+            doubt = math.sqrt(max(0.0, frame.scale_sd**2 - self._height_doubt_sd**2))
             self._height_doubt_sd = frame.scale_sd
-            height_sd = math.hypot(step.log_height_sd, claim_unseen_change(gap_s / _LONG_GAP_S).sd, doubt_sd)
+            height_sd = math.hypot(step.log_height_sd, doubt)
             odometry = OdometryMeasurement(moved_m, error_m, step.sd_m, step.log_height, height_sd)
         is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.attitude_gain_s2, frame.sd_m, odometry)
         if odometry and is_used:

@@ -169,15 +169,16 @@ def locate(
     else:
         tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else compute_nadir_sd(view, height_sd)
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
-    objection, far_m = None, _MAX_POSITION_SPREAD * pose.footprint_m
-    contradicting = []
-    for estimate in estimates:
-        distance_m = float(np.hypot(*(estimate.position_m - first.position_m)))
-        if estimate.score >= min_score and distance_m > far_m:
-            contradicting.append((estimate.score, distance_m))
-    agreeing_score = sum(estimate.score for estimate in agreeing)
-    if sum(score for score, _ in contradicting) > _MAX_CONTRADICTION_RATIO * agreeing_score:
-        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": max(contradicting)[1]})
+    others = [estimate for estimate in estimates if estimate.score >= min_score and not first.agrees_with(estimate)]
+    total_score = sum(estimate.score for estimate in (*agreeing, *others))
+    objection, far_score, farthest_m = None, 0.0, _MAX_POSITION_SPREAD * pose.footprint_m
+    for other in others:  # any of them may be right, in proportion to its score
+        offset_m = other.position_m - first.position_m
+        covariance += other.score / total_score * np.outer(offset_m, offset_m)
+        if (distance_m := float(np.hypot(*offset_m))) > _MAX_POSITION_SPREAD * pose.footprint_m:
+            far_score, farthest_m = far_score + other.score, max(farthest_m, distance_m)
+    if far_score > _MAX_CONTRADICTION_RATIO * sum(estimate.score for estimate in agreeing):
+        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": farthest_m})
     east_m, north_m = position_m.tolist()
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     return Located(

@@ -11,7 +11,7 @@ from typing import Any
 from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import Agreement, measure_agreement
-from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, Landmarks
+from edgevpr.runtime.recognise.landmarks import Landmarks
 from edgevpr.runtime.recognise.parallax import UNSEEN_SHIFT, HeightChange, ParallaxChain, Shift, claim_unseen_change
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
@@ -21,6 +21,7 @@ _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictu
 _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
 _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
+_START_LANDMARKS = 500  # of the earlier picture: enough for three pictures to share some
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +62,7 @@ class VisualOdometry:
         self._key: _Picture | None = None
         self._since_key = 0j  # moved since then, as a fraction of the picture's longest side: east + 1j * north
         self._chain, self._climb = ParallaxChain(), HeightChange()
+        self._measured_s = self._rate = 0.0  # end of the last step, and its length in a second, as such a fraction
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
@@ -74,6 +76,8 @@ class VisualOdometry:
         start, start_m = last.view, (last.view.footprint_m or 0.0) / last.view.height_scale
         east, north = picture_axes(start.up_deg or 0.0) @ (shift.offset.real, -shift.offset.imag)
         self._since_key += complex(east, north)
+        missed = claim_unseen_change(self._rate * (last.t_s - self._measured_s) / UNSEEN_SHIFT)
+        self._measured_s, self._rate = t_s, abs(shift.offset) / (t_s - last.t_s)
         climb, self._climb = self._climb, HeightChange()  # up to the start of this step
         height = self._follow_height(last, self._previous, shift)
         return OdometryStep(
@@ -83,7 +87,7 @@ class VisualOdometry:
             sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
             log_height=height.log_ratio + climb.log_ratio,
-            log_height_sd=math.hypot(height.sd, climb.sd),
+            log_height_sd=math.hypot(height.sd, climb.sd, missed.sd),
         )
 
     def _follow_height(self, last: _Picture, now: _Picture, shift: Shift) -> HeightChange:
@@ -107,7 +111,7 @@ def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:
         return None
     if one.footprint_m is None or other.footprint_m is None:
         return None
-    agreement = measure_agreement(now.landmarks, start.landmarks.select_best(PLACE_LANDMARKS))
+    agreement = measure_agreement(now.landmarks, start.landmarks.select_best(_START_LANDMARKS))
     if agreement.inliers < max(_MIN_INLIERS, _MIN_INLIER_RATIO * agreement.matched):
         return None
     pairs, rotation_deg, share = agreement.matched_points, agreement.rotation_deg, agreement.shift_share

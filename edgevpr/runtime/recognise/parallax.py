@@ -15,6 +15,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles
 
 _MIN_LANDMARKS = 8
+_MIN_COMMON, _MAX_SPREAD = 4, 0.15  # of the landmarks that three pictures share
 _TOLERANCE = 0.01  # fraction of the longest side
 _MIN_NEARNESS, _MAX_NEARNESS = 0.4, 2.5
 _PIXEL = 0.002  # fraction of the longest side
@@ -104,11 +105,11 @@ def _fit_scale(points: Array, targets: Array, scale: float) -> tuple[float, floa
 def _compare(before: Doubles, now: Doubles, length: float) -> HeightChange:
     """Return the change of height that landmarks show by their nearness, (n,), in two shifts."""
     ratios = np.log(now / before)
-    if len(ratios) < _MIN_LANDMARKS:
+    middle = float(np.median(ratios)) if len(ratios) else 0.0
+    spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length) if len(ratios) else 0.0
+    if len(ratios) < _MIN_COMMON or spread > _MAX_SPREAD:
         return claim_unseen_change(length / UNSEEN_SHIFT)
     # Their positions are whole pixels, so the median would not see a change of less than one.
-    middle = float(np.median(ratios))
-    spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length)
     kept = ratios[np.abs(ratios - middle) <= 2.5 * spread]
     scatter = max(float(kept.std()), 0.5 * spread)
     sd = math.hypot(scatter * math.sqrt(_DEPENDENT_LANDMARKS / len(kept)), _CHANGE_SD * float(kept.mean()))

@@ -120,6 +120,7 @@ def test_locate_skips_a_slightly_inconsistent_place_without_objection():
     assert found.places == (1,)
     assert found.objection is None
     assert measure_offset_m(found.position) == pytest.approx((8, 0), abs=0.01)
+    assert found.accuracy_m > 7.0, "the other place, 12 m off, may be the right one"
 
 
 @pytest.mark.parametrize(

@@ -118,6 +118,21 @@ def test_landmarks_in_a_narrow_band_show_no_climb(ground):
     assert math.hypot(*sds) < 0.1
 
 
+def test_step_that_cannot_be_measured_leaves_the_height_unknown_by_the_way_flown(ground):
+    odometry, pose = VisualOdometry(), START
+    view, landmarks = take_picture(ground, pose, pose, [])
+    dark = detect_landmarks(np.zeros((48, 64), np.uint8))
+    steps = []
+    for number, east_m in enumerate((110.0, 120.0, 130.0, None, 150.0, 160.0)):
+        if east_m:
+            pose = replace(START, east_m=east_m)
+            view, landmarks = take_picture(ground, pose, pose, [])
+        steps.append(odometry.measure(float(number), view, landmarks if east_m else dark))
+    assert steps[0] is steps[3] is steps[4] is None
+    assert steps[2].log_height_sd < 0.05
+    assert 0.1 < steps[5].log_height_sd < 0.25, "20 m, of 65 m after which it may be anything"
+
+
 def test_ground_that_no_three_pictures_share_is_claimed_as_unknown(ground):
     steps = fly(ground, 65.0, [])
     assert sum_heights(steps[:1])[1] == 0.0, "there is nothing to compare the first step with"
