@@ -179,10 +179,9 @@ def locate(
             far_score, farthest_m = far_score + other.score, max(farthest_m, distance_m)
     if far_score > _MAX_CONTRADICTION_RATIO * sum(estimate.score for estimate in agreeing):
         objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": farthest_m})
-    east_m, north_m = position_m.tolist()
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     return Located(
-        position=move_position(best.position, east_m, north_m, best.position.alt_m),
+        position=move_position(best.position, *position_m.tolist(), best.position.alt_m),
         covariance_m2=to_triple(covariance),
         heading_deg=(pose.up_deg + first.rotation_deg) % 360,
         height_ratio=first.height_ratio and first.height_ratio * view.zoom,

@@ -12,7 +12,7 @@ from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import Agreement, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks
-from edgevpr.runtime.recognise.parallax import UNSEEN_SHIFT, HeightChange, ParallaxChain, Shift, claim_unseen_change
+from edgevpr.runtime.recognise.parallax import HeightChange, ParallaxChain, Shift, claim_unseen_change
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
 _MIN_INLIERS = 30
@@ -21,6 +21,9 @@ _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictu
 _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
 _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
+_UNSEEN_SHIFT = (
+    0.5  # fraction over which any change is possible between pictures that do not agree: perhaps because of it
+)
 _START_LANDMARKS = 500  # of the earlier picture: enough for three pictures to share some
 
 
@@ -76,7 +79,7 @@ class VisualOdometry:
         start, start_m = last.view, (last.view.footprint_m or 0.0) / last.view.height_scale
         east, north = picture_axes(start.up_deg or 0.0) @ (shift.offset.real, -shift.offset.imag)
         self._since_key += complex(east, north)
-        missed = claim_unseen_change(self._rate * (last.t_s - self._measured_s) / UNSEEN_SHIFT)
+        missed = claim_unseen_change(self._rate * (last.t_s - self._measured_s) / _UNSEEN_SHIFT)
         self._measured_s, self._rate = t_s, abs(shift.offset) / (t_s - last.t_s)
         climb, self._climb = self._climb, HeightChange()  # up to the start of this step
         height = self._follow_height(last, self._previous, shift)
@@ -101,7 +104,7 @@ class VisualOdometry:
             change, self._climb = self._chain.add(found[0])
             return change
         self._chain = ParallaxChain()
-        return claim_unseen_change(share / UNSEEN_SHIFT)
+        return claim_unseen_change(share / _UNSEEN_SHIFT)
 
 
 def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:

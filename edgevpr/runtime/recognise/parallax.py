@@ -25,7 +25,7 @@ _CHANGE_SD = 0.25
 _DEPENDENT_LANDMARKS = 5.0
 _SCALE_SD = 0.01  # by how much the scale across the motion is expected to differ from that of the whole picture
 _UNSEEN_SD = 0.3  # of a change that is not seen: a valley 30 m deep below 100 m
-UNSEEN_SHIFT = 0.5  # fraction of the longest side over which any change is possible
+_UNLINKED_SHIFT = 1.0  # fraction of the longest side over which any change is possible between pictures that agree
 
 
 class HeightChange(NamedTuple):
@@ -49,9 +49,8 @@ class Shift:
 
 
 def claim_unseen_change(part: float) -> HeightChange:
-    """Return the change of height to claim where nothing shows it: over this `part` of the ground or time that allows
-    any change."""
-    return HeightChange(sd=_UNSEEN_SD * math.sqrt(min(1.0, max(0.0, part))))
+    """Return the change of height to claim where nothing shows it: over this `part` of the way that allows any."""
+    return HeightChange(sd=_UNSEEN_SD * min(1.0, part))
 
 
 class ParallaxChain:
@@ -85,21 +84,21 @@ class ParallaxChain:
 def _fit_scale(points: Array, targets: Array, scale: float) -> tuple[float, float]:
     """Return the scale from `points` to `targets`, complex (n,) each, and its standard deviation, by their imaginary
     parts: across the motion there is no parallax. Points in a narrow band hardly show it: then it is near `scale`, that
-    of the whole picture."""
-    matrix = np.stack([points.imag, points.real, np.ones(len(points))], axis=1)
-    factors = np.array([scale, 0.0, 0.0])
+    of the whole picture. It is the ratio of their deviations: a regression of one on the other would be too flat."""
+    across = np.stack([points.imag, targets.imag], axis=1)
+    matrix = np.stack([points.real, np.ones(len(points))], axis=1)
+    is_used, fit = np.abs(across @ (scale, -1.0)) <= _TOLERANCE, scale
     for _ in range(3):
-        residuals = matrix @ factors - targets.imag
-        is_used = np.abs(residuals) <= _TOLERANCE
         if np.count_nonzero(is_used) < _MIN_LANDMARKS:
             return scale, _SCALE_SD
-        used = matrix[is_used]
-        inverse = np.linalg.inv(used.T @ used + 1e-9 * np.eye(3))
-        factors = inverse @ used.T @ targets.imag[is_used]
-    variance = max(float(np.mean(residuals[is_used] ** 2)), _PIXEL**2 / 12)
-    fit_variance = _DEPENDENT_LANDMARKS * variance * float(inverse[0, 0])
-    weight = _SCALE_SD**2 / (_SCALE_SD**2 + fit_variance)
-    return scale + weight * (float(factors[0]) - scale), math.sqrt(weight * fit_variance)
+        turned = across - matrix @ np.linalg.lstsq(matrix[is_used], across[is_used], rcond=None)[0]
+        spread2 = (turned[is_used] ** 2).sum(axis=0) + 1e-9
+        fit = math.sqrt(spread2[1] / spread2[0])
+        residuals = turned @ (fit, -1.0)
+        variance = max(float(np.mean(residuals[is_used] ** 2)), _PIXEL**2 / 12) * _DEPENDENT_LANDMARKS / spread2[0]
+        is_used = np.abs(residuals) <= _TOLERANCE
+    weight = _SCALE_SD**2 / (_SCALE_SD**2 + variance)
+    return scale + weight * (fit - scale), math.sqrt(weight * variance)
 
 
 def _compare(before: Doubles, now: Doubles, length: float) -> HeightChange:
@@ -108,7 +107,7 @@ def _compare(before: Doubles, now: Doubles, length: float) -> HeightChange:
     middle = float(np.median(ratios)) if len(ratios) else 0.0
     spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length) if len(ratios) else 0.0
     if len(ratios) < _MIN_COMMON or spread > _MAX_SPREAD:
-        return claim_unseen_change(length / UNSEEN_SHIFT)
+        return claim_unseen_change(length / _UNLINKED_SHIFT)
     # Their positions are whole pixels, so the median would not see a change of less than one.
     kept = ratios[np.abs(ratios - middle) <= 2.5 * spread]
     scatter = max(float(kept.std()), 0.5 * spread)

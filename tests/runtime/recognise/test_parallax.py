@@ -130,10 +130,10 @@ def test_step_that_cannot_be_measured_leaves_the_height_unknown_by_the_way_flown
         steps.append(odometry.measure(float(number), view, landmarks if east_m else dark))
     assert steps[0] is steps[3] is steps[4] is None
     assert steps[2].log_height_sd < 0.05
-    assert 0.1 < steps[5].log_height_sd < 0.25, "20 m, of 65 m after which it may be anything"
+    assert steps[5].log_height_sd == pytest.approx(0.3 * 20 / 65, rel=0.05), "after 65 m it may be anything"
 
 
 def test_ground_that_no_three_pictures_share_is_claimed_as_unknown(ground):
     steps = fly(ground, 65.0, [])
     assert sum_heights(steps[:1])[1] == 0.0, "there is nothing to compare the first step with"
-    assert all(step.log_height_sd > 0.2 for step in steps[1:])
+    assert all(step.log_height_sd > 0.14 for step in steps[1:])
