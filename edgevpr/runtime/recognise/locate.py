@@ -181,7 +181,7 @@ def locate(
         objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": farthest_m})
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     return Located(
-        position=move_position(best.position, *position_m.tolist(), best.position.alt_m),
+        position=move_position(best.position, float(position_m[0]), float(position_m[1]), best.position.alt_m),
         covariance_m2=to_triple(covariance),
         heading_deg=(pose.up_deg + first.rotation_deg) % 360,
         height_ratio=first.height_ratio and first.height_ratio * view.zoom,
