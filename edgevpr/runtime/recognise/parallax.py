@@ -25,7 +25,7 @@ _CHANGE_SD = 0.25
 _DEPENDENT_LANDMARKS = 5.0
 _SCALE_SD = 0.01  # by how much the scale across the motion is expected to differ from that of the whole picture
 _UNSEEN_SD = 0.3  # of a change that is not seen: a valley 30 m deep below 100 m
-_UNLINKED_SHIFT = 1.0  # fraction of the longest side over which any change is possible between pictures that agree
+_UNLINKED_SHIFT = 2.0  # fraction of the longest side over which any change is possible between pictures that agree
 
 
 class HeightChange(NamedTuple):
