@@ -69,7 +69,7 @@ class Navigation:
         self._unconfirmed: list[PositionedMatch] = []  # agree with each other; nothing else supports them
         self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
-        self._height_doubt_sd = 0.0  # error of the scale of odometry that is claimed because heights contradict
+        self._doubt_m = np.zeros(2)  # error of odometry since the last fix or GPS position, because heights contradict
         self._contradicted_since_s: float | None = None
 
     @property
@@ -187,7 +187,7 @@ class Navigation:
         return True
 
     def _record_gps(self, now_s: float) -> None:
-        self.last_gps_s, self.is_confirmed = now_s, True
+        self.last_gps_s, self.is_confirmed, self._doubt_m = now_s, True, np.zeros(2)
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         self._filter.restart_odometry_scale(error, tolerance)
@@ -215,10 +215,8 @@ class Navigation:
         if step and before and before.t_s == step.from_s:
             moved_m = np.array(step.moved_m)
             error_m = moved_m - (point.position_m - before.position_m)
-            doubt = math.sqrt(max(0.0, frame.scale_sd**2 - self._height_doubt_sd**2))
-            self._height_doubt_sd = frame.scale_sd
-            height_sd = math.hypot(step.log_height_sd, doubt)
-            odometry = OdometryMeasurement(moved_m, error_m, step.sd_m, step.log_height, height_sd)
+            odometry = OdometryMeasurement(moved_m, error_m, step.sd_m, step.log_height, step.log_height_sd)
+            self._doubt_m = self._doubt_m + frame.scale_sd * moved_m
         is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.attitude_gain_s2, frame.sd_m, odometry)
         if odometry and is_used:
             self._last_odometry_s = frame.t_s
@@ -251,7 +249,7 @@ class Navigation:
                 self._filter.correct_by_attitude_error(np.array(error.nadir_shift), error.sd)
             if match.heading_error_deg is not None:
                 self._filter.correct_by_rotation(math.radians(match.heading_error_deg))
-            self.last_fix_s = max(self.last_fix_s, match.t_s)
+            self.last_fix_s, self._doubt_m = max(self.last_fix_s, match.t_s), np.zeros(2)
 
     def _judge_support(self, fix: PredictedFix, verdict: GateResult) -> None:
         """Update `is_confirmed` with an accepted fix."""
@@ -301,7 +299,7 @@ class Navigation:
             t_s=t_s,
             position=move_position(path.origin, *position_m.tolist()),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
-            accuracy_m=compute_worst_sd(covariance[:2, :2]),
+            accuracy_m=math.hypot(compute_worst_sd(covariance[:2, :2]), *self._doubt_m),
             speed_accuracy_m_s=compute_worst_sd(covariance[2:, 2:]),
         )
 

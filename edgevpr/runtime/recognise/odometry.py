@@ -12,7 +12,7 @@ from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import Agreement, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks
-from edgevpr.runtime.recognise.parallax import HeightChange, ParallaxChain, Shift, claim_unseen_change
+from edgevpr.runtime.recognise.parallax import UNLINKED_SHIFT, HeightChange, ParallaxChain, Shift, claim_unseen_change
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
 _MIN_INLIERS = 30
@@ -21,9 +21,7 @@ _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictu
 _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
 _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
-_UNSEEN_SHIFT = (
-    0.5  # fraction over which any change is possible between pictures that do not agree: perhaps because of it
-)
+_UNSEEN_SHIFT = 0.5  # fraction over which any change is possible where pictures do not agree, perhaps because of it
 _START_LANDMARKS = 500  # of the earlier picture: enough for three pictures to share some
 
 
@@ -72,17 +70,15 @@ class VisualOdometry:
         last, self._previous = self._previous, _Picture(t_s, view, landmarks)
         found = _compare(last, self._previous) if last and 0 < t_s - last.t_s <= _MAX_ELAPSED_S else None
         if last is None or found is None:
-            self._key, self._since_key = self._previous, 0j
-            self._chain, self._climb = ParallaxChain(), HeightChange()
             return None
         shift, agreement = found
         start, start_m = last.view, (last.view.footprint_m or 0.0) / last.view.height_scale
         east, north = picture_axes(start.up_deg or 0.0) @ (shift.offset.real, -shift.offset.imag)
         self._since_key += complex(east, north)
-        missed = claim_unseen_change(self._rate * (last.t_s - self._measured_s) / _UNSEEN_SHIFT)
+        missed = self._rate * (last.t_s - self._measured_s)
         self._measured_s, self._rate = t_s, abs(shift.offset) / (t_s - last.t_s)
         climb, self._climb = self._climb, HeightChange()  # up to the start of this step
-        height = self._follow_height(last, self._previous, shift)
+        height = self._follow_height(last, self._previous, shift, missed)
         return OdometryStep(
             from_s=last.t_s,
             to_s=t_s,
@@ -90,21 +86,23 @@ class VisualOdometry:
             sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
             log_height=height.log_ratio + climb.log_ratio,
-            log_height_sd=math.hypot(height.sd, climb.sd, missed.sd),
+            log_height_sd=math.hypot(height.sd, climb.sd),
         )
 
-    def _follow_height(self, last: _Picture, now: _Picture, shift: Shift) -> HeightChange:
-        """Return the change of height above ground if the aircraft has moved far enough since the key picture."""
-        share, key = abs(self._since_key), self._key
-        if share < _MIN_KEY_SHIFT:
+    def _follow_height(self, last: _Picture, now: _Picture, shift: Shift, missed: float) -> HeightChange:
+        """Return the change of height above ground if the aircraft has moved far enough since the key picture, or if
+        steps were `missed` since: then this picture may still show the ground of the key picture."""
+        share, key = abs(self._since_key), self._key or last
+        self._key = key
+        if share + missed < _MIN_KEY_SHIFT:
             return HeightChange()
-        found = (shift,) if key is last else key and _compare(key, now)
+        found = (shift,) if key is last else _compare(key, now)
         self._key, self._since_key = now, 0j
         if found and abs(found[0].offset) >= _MIN_KEY_SHIFT / 2:
             change, self._climb = self._chain.add(found[0])
             return change
         self._chain = ParallaxChain()
-        return claim_unseen_change(share / _UNSEEN_SHIFT)
+        return claim_unseen_change(missed / _UNSEEN_SHIFT + share / UNLINKED_SHIFT)
 
 
 def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:

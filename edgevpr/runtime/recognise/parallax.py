@@ -25,7 +25,7 @@ _CHANGE_SD = 0.25
 _DEPENDENT_LANDMARKS = 5.0
 _SCALE_SD = 0.01  # by how much the scale across the motion is expected to differ from that of the whole picture
 _UNSEEN_SD = 0.3  # of a change that is not seen: a valley 30 m deep below 100 m
-_UNLINKED_SHIFT = 2.0  # fraction of the longest side over which any change is possible between pictures that agree
+UNLINKED_SHIFT = 2.0  # fraction of the longest side over which any change is possible between pictures that agree
 
 
 class HeightChange(NamedTuple):
@@ -107,7 +107,7 @@ def _compare(before: Doubles, now: Doubles, length: float) -> HeightChange:
     middle = float(np.median(ratios)) if len(ratios) else 0.0
     spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length) if len(ratios) else 0.0
     if len(ratios) < _MIN_COMMON or spread > _MAX_SPREAD:
-        return claim_unseen_change(length / _UNLINKED_SHIFT)
+        return claim_unseen_change(length / UNLINKED_SHIFT)
     # Their positions are whole pixels, so the median would not see a change of less than one.
     kept = ratios[np.abs(ratios - middle) <= 2.5 * spread]
     scatter = max(float(kept.std()), 0.5 * spread)

@@ -118,7 +118,7 @@ def test_landmarks_in_a_narrow_band_show_no_climb(ground):
     assert math.hypot(*sds) < 0.1
 
 
-def test_step_that_cannot_be_measured_leaves_the_height_unknown_by_the_way_flown(ground):
+def test_height_is_followed_over_a_step_that_cannot_be_measured(ground):
     odometry, pose = VisualOdometry(), START
     view, landmarks = take_picture(ground, pose, pose, [])
     dark = detect_landmarks(np.zeros((48, 64), np.uint8))
@@ -130,7 +130,7 @@ def test_step_that_cannot_be_measured_leaves_the_height_unknown_by_the_way_flown
         steps.append(odometry.measure(float(number), view, landmarks if east_m else dark))
     assert steps[0] is steps[3] is steps[4] is None
     assert steps[2].log_height_sd < 0.05
-    assert steps[5].log_height_sd == pytest.approx(0.3 * 20 / 65, rel=0.05), "after 65 m it may be anything"
+    assert max(step.log_height_sd for step in steps if step) < 0.03, "the picture before shows the same ground"
 
 
 def test_ground_that_no_three_pictures_share_is_claimed_as_unknown(ground):
