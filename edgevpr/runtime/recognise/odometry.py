@@ -20,6 +20,7 @@ _MIN_INLIER_RATIO = 0.4
 _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictures
 _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
+_NOISE_SIGMA = 2.0  # smaller changes of height are noise: over flat ground, following it doubled the error
 _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
 _UNSEEN_SHIFT = 0.5  # fraction over which any change is possible where pictures do not agree, perhaps because of it
 _START_LANDMARKS = 500  # of the earlier picture: enough for three pictures to share some
@@ -63,6 +64,7 @@ class VisualOdometry:
         self._key: _Picture | None = None
         self._since_key = 0j  # moved since then, as a fraction of the picture's longest side: east + 1j * north
         self._chain, self._climb = ParallaxChain(), HeightChange()
+        self._pending, self._pending_variance = 0.0, 0.0  # change of height that may be noise
         self._measured_s = self._rate = 0.0  # end of the last step, and its length in a second, as such a fraction
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
@@ -78,16 +80,28 @@ class VisualOdometry:
         missed = self._rate * (last.t_s - self._measured_s)
         self._measured_s, self._rate = t_s, abs(shift.offset) / (t_s - last.t_s)
         climb, self._climb = self._climb, HeightChange()  # up to the start of this step
-        height = self._follow_height(last, self._previous, shift, missed)
+        height = self._settle(climb, self._follow_height(last, self._previous, shift, missed))
         return OdometryStep(
             from_s=last.t_s,
             to_s=t_s,
             moved_m=(start_m * float(east), start_m * float(north)),
             sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
             inliers=agreement.inliers,
-            log_height=height.log_ratio + climb.log_ratio,
-            log_height_sd=math.hypot(height.sd, climb.sd),
+            log_height=height.log_ratio,
+            log_height_sd=height.sd,
         )
+
+    def _settle(self, *changes: HeightChange) -> HeightChange:
+        """Return the change of height to use: that measured, once it is more than noise, and all that is not seen."""
+        seen = sum(change.sd**2 for change in changes if change.log_ratio)
+        unseen = sum(change.sd**2 for change in changes if not change.log_ratio)
+        self._pending += sum(change.log_ratio for change in changes)
+        self._pending_variance += seen
+        if abs(self._pending) <= _NOISE_SIGMA * math.sqrt(self._pending_variance):
+            return HeightChange(0.0, math.sqrt(unseen + seen / 4))
+        settled = HeightChange(self._pending, math.sqrt(unseen + self._pending_variance))
+        self._pending = self._pending_variance = 0.0
+        return settled
 
     def _follow_height(self, last: _Picture, now: _Picture, shift: Shift, missed: float) -> HeightChange:
         """Return the change of height above ground if the aircraft has moved far enough since the key picture, or if
