@@ -62,6 +62,7 @@ class Navigation:
         self._path: Path | None = None
         self._unplaced_path: Path | None = None  # the last accelerations, while the position is unknown
         self._filter = DriftFilter(drift, map_sd_m)
+        self.restart_odometry_scale = self._filter.restart_odometry_scale
         self._frame_point: Point | None = None  # of the path, when the last frame was taken
         self._last_fix_m: Doubles | None = None  # (2,) from the origin of the path
         self.has_gps = self.is_in_doubt = False
@@ -188,9 +189,6 @@ class Navigation:
 
     def _record_gps(self, now_s: float) -> None:
         self.last_gps_s, self.is_confirmed, self._doubt_m = now_s, True, np.zeros(2)
-
-    def restart_odometry_scale(self, error: float, tolerance: float) -> None:
-        self._filter.restart_odometry_scale(error, tolerance)
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""

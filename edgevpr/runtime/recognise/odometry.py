@@ -60,11 +60,9 @@ class VisualOdometry:
 
     def __init__(self) -> None:
         self._previous: _Picture | None = None
-        # Depths are compared in key pictures: between frames of a slow flight, landmarks shift too little to show them.
-        self._key: _Picture | None = None
+        self._key: _Picture | None = None  # depths are compared from key to key: between frames, shifts may be small
         self._since_key = 0j  # moved since then, as a fraction of the picture's longest side: east + 1j * north
-        self._chain, self._climb = ParallaxChain(), HeightChange()
-        self._pending, self._pending_variance = 0.0, 0.0  # change of height that may be noise
+        self._chain, self._climb, self._pending = ParallaxChain(), HeightChange(), HeightChange()
         self._measured_s = self._rate = 0.0  # end of the last step, and its length in a second, as such a fraction
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
@@ -93,21 +91,18 @@ class VisualOdometry:
 
     def _settle(self, *changes: HeightChange) -> HeightChange:
         """Return the change of height to use: that measured, once it is more than noise, and all that is not seen."""
-        seen = sum(change.sd**2 for change in changes if change.log_ratio)
-        unseen = sum(change.sd**2 for change in changes if not change.log_ratio)
-        self._pending += sum(change.log_ratio for change in changes)
-        self._pending_variance += seen
-        if abs(self._pending) <= _NOISE_SIGMA * math.sqrt(self._pending_variance):
-            return HeightChange(0.0, math.sqrt(unseen + seen / 4))
-        settled = HeightChange(self._pending, math.sqrt(unseen + self._pending_variance))
-        self._pending = self._pending_variance = 0.0
-        return settled
+        seen_sd = math.hypot(*(change.sd for change in changes if change.log_ratio))
+        unseen_sd = math.hypot(*(change.sd for change in changes if not change.log_ratio))
+        log_ratio = self._pending.log_ratio + sum(change.log_ratio for change in changes)
+        self._pending = HeightChange(log_ratio, math.hypot(self._pending.sd, seen_sd))
+        if abs(log_ratio) <= _NOISE_SIGMA * self._pending.sd:
+            return HeightChange(0.0, math.hypot(unseen_sd, seen_sd / 2))
+        settled, self._pending = self._pending, HeightChange()
+        return HeightChange(log_ratio, math.hypot(unseen_sd, settled.sd))
 
     def _follow_height(self, last: _Picture, now: _Picture, shift: Shift, missed: float) -> HeightChange:
-        """Return the change of height above ground if the aircraft has moved far enough since the key picture, or if
-        steps were `missed` since: then this picture may still show the ground of the key picture."""
-        share, key = abs(self._since_key), self._key or last
-        self._key = key
+        """Return the change of height since the key picture, if that is far enough away, or steps were `missed`."""
+        share, self._key = abs(self._since_key), (key := self._key or last)
         if share + missed < _MIN_KEY_SHIFT:
             return HeightChange()
         found = (shift,) if key is last else _compare(key, now)

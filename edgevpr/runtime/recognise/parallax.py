@@ -2,8 +2,7 @@
 
 A step over ground that lies a third lower looks a quarter shorter. But in view, a landmark keeps its depth below the
 camera: between two pictures it shifts by the camera's motion divided by this depth. If the landmarks below the camera
-shifted less than others in the last step, and as much as they do in this one, the ground here is lower. A fit to the
-whole picture does not show it: at a cliff it follows the larger part, and on a slope its scale changes the wrong way.
+shifted less than others in the last step, and as much as they do in this one, the ground here is lower.
 """
 
 import math
@@ -19,8 +18,7 @@ _MIN_COMMON, _MAX_SPREAD = 4, 0.15  # of the landmarks that three pictures share
 _TOLERANCE = 0.01  # fraction of the longest side
 _MIN_NEARNESS, _MAX_NEARNESS = 0.4, 2.5
 _PIXEL = 0.002  # fraction of the longest side
-# Standard deviation of a measured change: a part of it, and the scatter of the landmarks, of which so many neighbours
-# have a common error.
+# Standard deviation of a measured change: a part of it, and the scatter of landmarks, of which so many err alike.
 _CHANGE_SD = 0.25
 _DEPENDENT_LANDMARKS = 5.0
 _SCALE_SD = 0.01  # by how much the scale across the motion is expected to differ from that of the whole picture
@@ -61,8 +59,8 @@ class ParallaxChain:
 
     def add(self, shift: Shift) -> tuple[HeightChange, HeightChange]:
         """Return by how much the height above ground at this shift differs from that at the last one, and the climb
-        during it, beyond what the reported heights explain. The nearness of a landmark is the height above ground
-        divided by its depth. A tilt that is not told changes both, by opposite amounts."""
+        during it, beyond what the reported heights explain (a tilt that is not told changes both, by opposite amounts).
+        Nearness is the height above ground divided by a landmark's depth."""
         length, turn = abs(shift.offset), shift.factor / abs(shift.factor)
         axis = shift.offset / length
         points = turn * (shift.pairs[0] - shift.nadirs[0]) / axis
@@ -83,8 +81,7 @@ class ParallaxChain:
 
 def _fit_scale(points: Array, targets: Array, scale: float) -> tuple[float, float]:
     """Return the scale from `points` to `targets`, complex (n,) each, and its standard deviation, by their imaginary
-    parts: across the motion there is no parallax. Points in a narrow band hardly show it: then it is near `scale`, that
-    of the whole picture. It is the ratio of their deviations: a regression of one on the other would be too flat."""
+    parts: across the motion there is no parallax. In a narrow band it is near `scale`, that of the whole picture."""
     across = np.stack([points.imag, targets.imag], axis=1)
     matrix = np.stack([points.real, np.ones(len(points))], axis=1)
     is_used, fit = np.abs(across @ (scale, -1.0)) <= _TOLERANCE, scale
