@@ -192,7 +192,7 @@ class ClosedLoop:
             sd_m=_STRIDE_SD_M,
             inliers=100,
             log_height=log_height,
-            log_height_sd=math.hypot(0.25 * log_height, claim_unseen_change(missed_m / (_VIEW.footprint_m / 2)).sd),
+            log_height_sd=math.hypot(0.25 * log_height, claim_unseen_change(missed_m / _VIEW.footprint_m).sd),
         )
 
     def _noise(self, sd):

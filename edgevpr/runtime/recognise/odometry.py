@@ -22,7 +22,7 @@ _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
 _NOISE_SIGMA = 2.0  # smaller changes of height are noise: over flat ground, following it doubled the error
 _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
-_UNSEEN_SHIFT = 0.5  # fraction over which any change is possible where pictures do not agree, perhaps because of it
+_UNSEEN_SHIFT = 1.0  # fraction over which any change is possible where pictures do not agree, perhaps because of it
 _START_LANDMARKS = 500  # of the earlier picture: enough for three pictures to share some
 
 

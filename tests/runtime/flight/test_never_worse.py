@@ -161,7 +161,7 @@ def test_px4_without_gps_or_images_gets_nothing_and_the_operator_is_informed():
     assert not flight.positions_sent(0)
 
 
-@pytest.mark.parametrize(("unseen_s", "scale"), [(0, 1.4), (0, 0.75), (1, 1.15), (1, 0.87), (4, 1.4), (4, 0.75)])
+@pytest.mark.parametrize(("unseen_s", "scale"), [(0, 1.4), (0, 0.75), (1, 1.1), (1, 0.92), (4, 1.4), (4, 0.75)])
 @pytest.mark.parametrize(
     ("vehicle", "parameters"), [("arducopter", GPS_INPUT), ("arduplane", {}), ("px4-copter", SENSOR)]
 )
