@@ -7,6 +7,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles
 from edgevpr.runtime.recognise.locate import mahalanobis
+from edgevpr.runtime.recognise.odometry import OdometryStep
 
 GRAVITY_M_S2 = 9.80665
 # Time constant of the attitude error of an autopilot that dead-reckons. Only some pictures show this error:
@@ -78,19 +79,6 @@ INERTIAL = Drift(
 )  # fmt: skip
 # In its simulator PX4's heading is up to 20 degrees wrong.
 INERTIAL_PX4 = replace(INERTIAL, heading_sd=0.15, attitude_follows_positions=True)
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryMeasurement:
-    """A step of visual odometry (see `recognise.odometry`): the displacement `moved_m` (2,), its difference from
-    that of the path, `error_m` (2,), and the standard deviation `sd_m` of each axis. `log_height`: natural logarithm of
-    its scale divided by that of the last step, with the standard deviation `log_height_sd`."""
-
-    moved_m: Doubles
-    error_m: Doubles
-    sd_m: float
-    log_height: float = 0.0
-    log_height_sd: float = 0.0
 
 
 class DriftFilter:
@@ -178,26 +166,26 @@ class DriftFilter:
         self._correct(matrix[: errors.size], errors, np.diag(variances[: errors.size]))
 
     def add_frame(
-        self, age_s: float, attitude_gain_s2: float, sd_m: float, odometry: OdometryMeasurement | None = None
+        self, age_s: float, attitude_gain_s2: float, sd_m: float, step: OdometryStep | None, path_moved_m: Doubles
     ) -> bool:
-        """Process a frame taken `age_s` ago, and correct the state by the `odometry` since the previous frame (None:
-        unknown). `sd_m` is the standard deviation of its position on each axis, without the effect of the attitude
-        error. Returns False if the odometry contradicts the state and is not used."""
+        """Process a frame taken `age_s` ago, and correct the state by the `step` of odometry since the previous frame
+        (None: unknown), in which the path moved by `path_moved_m` (2,). `sd_m`: of the frame's position on each axis,
+        without the effect of the attitude error. Returns False if the step contradicts the state and is not used."""
         self._frame = position, variance_m2 = self._make_position_jacobian(age_s, attitude_gain_s2), sd_m**2
-        if odometry is None:
+        if step is None:
             self._begin_frame()
             return True
-        ratio = math.exp(odometry.log_height)
+        ratio = math.exp(step.log_height)
         self._x[_SCALE] = ratio * (1.0 + self._x[_SCALE]) - 1.0
         self._p[_SCALE] *= ratio
         self._p[:, _SCALE] *= ratio
-        self._p[_SCALE, _SCALE] += (ratio * odometry.log_height_sd) ** 2
-        (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, _IDENTITY.copy()
+        self._p[_SCALE, _SCALE] += (ratio * step.log_height_sd) ** 2
+        (east_m, north_m), matrix, transition = step.moved_m, position - _FRAME, _IDENTITY.copy()
         transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
         transition[_F, _HEADING] = transition[_F, _TURN]
         x, p = transition @ self._x, transition @ self._p @ transition.T
-        x[_F] += odometry.error_m
-        p[_F, _F] += odometry.sd_m**2 * _EYE
+        x[_F] += np.array(step.moved_m) - path_moved_m
+        p[_F, _F] += step.sd_m**2 * _EYE
         if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
             self._begin_frame()
             return False

@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import move_position
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import MAX_FIX_AGE_S, RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix, confirm_each_other
-from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
+from edgevpr.runtime.flight.drift import Drift, DriftFilter
 from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
@@ -62,7 +62,6 @@ class Navigation:
         self._path: Path | None = None
         self._unplaced_path: Path | None = None  # the last accelerations, while the position is unknown
         self._filter = DriftFilter(drift, map_sd_m)
-        self.restart_odometry_scale = self._filter.restart_odometry_scale
         self._frame_point: Point | None = None  # of the path, when the last frame was taken
         self._last_fix_m: Doubles | None = None  # (2,) from the origin of the path
         self.has_gps = self.is_in_doubt = False
@@ -190,6 +189,9 @@ class Navigation:
     def _record_gps(self, now_s: float) -> None:
         self.last_gps_s, self.is_confirmed, self._doubt_m = now_s, True, np.zeros(2)
 
+    def restart_odometry_scale(self, error: float, tolerance: float) -> None:
+        self._filter.restart_odometry_scale(error, tolerance)
+
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
         if not self._drift.is_inertial:
@@ -209,14 +211,12 @@ class Navigation:
         self._frame_point = point = path.interpolate(frame.t_s) if path else None
         if path is None or point is None:
             return
-        step, odometry = frame.odometry, None
-        if step and before and before.t_s == step.from_s:
-            moved_m = np.array(step.moved_m)
-            error_m = moved_m - (point.position_m - before.position_m)
-            odometry = OdometryMeasurement(moved_m, error_m, step.sd_m, step.log_height, step.log_height_sd)
-            self._doubt_m = self._doubt_m + frame.scale_sd * moved_m
-        is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.attitude_gain_s2, frame.sd_m, odometry)
-        if odometry and is_used:
+        step, path_moved_m = None, np.zeros(2)
+        if frame.odometry and before and before.t_s == frame.odometry.from_s:
+            step, path_moved_m = frame.odometry, point.position_m - before.position_m
+            self._doubt_m = self._doubt_m + frame.scale_sd * np.array(step.moved_m)
+        age_s = path.now.t_s - frame.t_s
+        if self._filter.add_frame(age_s, frame.attitude_gain_s2, frame.sd_m, step, path_moved_m) and step:
             self._last_odometry_s = frame.t_s
 
     def predict_fix(self, match: PositionedMatch) -> PredictedFix | None:

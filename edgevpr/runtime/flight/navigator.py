@@ -306,8 +306,7 @@ class Navigator(Listener):
         return Advice(fix) if has_none and not self._channel.is_continuous else _withhold(ReasonCode.NO_TELEMETRY)
 
     def _confirm(self, fix: Fix, match: PositionedMatch) -> Advice:
-        """Advise on the fix of a match that nothing predicts: it is held back until others agree, within what can be
-        flown."""
+        """Advise on the fix of a match that nothing predicts: hold it back until others, within reach, agree."""
         if self._unconfirmed and not can_follow(self._unconfirmed[-1], match):
             self._unconfirmed = []
         self._unconfirmed = [*self._unconfirmed[-3:], match]  # four are enough
@@ -384,8 +383,7 @@ class Navigator(Listener):
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 
     def _compute_accuracy_m(self, estimate: NavState) -> float:
-        """Return the accuracy of an estimate: never better than a tilt of the camera allows, which the filter cannot
-        average out."""
+        """Return the accuracy of an estimate: not better than a camera tilt allows, which no filter averages out."""
         return max(estimate.accuracy_m, self._common_tilt_m)
 
     def _compute_claimed_m(self, estimate: NavState) -> float:

@@ -113,8 +113,7 @@ class Vitals:
         if parts.io.status:
             parts.io.status.write(status)
         if parts.autopilot:
-            temperature_c, is_paused = parts.meter.thermal.temperature_c, self._commands.is_paused
-            parts.autopilot.report(health, load, temperature_c, is_paused=is_paused)
+            parts.autopilot.report(health, load, parts.meter.thermal.temperature_c, is_paused=self._commands.is_paused)
 
     def _check_source(self) -> None:
         source = self._parts.source

@@ -170,15 +170,15 @@ def locate(
         tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else compute_nadir_sd(view, height_sd)
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     others = [estimate for estimate in estimates if estimate.score >= min_score and not first.agrees_with(estimate)]
-    total_score = sum(estimate.score for estimate in (*agreeing, *others))
-    objection, far_score, farthest_m = None, 0.0, _MAX_POSITION_SPREAD * pose.footprint_m
+    agreeing_score = sum(estimate.score for estimate in agreeing)
+    total_score, far_m = agreeing_score + sum(other.score for other in others), _MAX_POSITION_SPREAD * pose.footprint_m
+    far_score = farthest_m = 0.0
     for other in others:  # any of them may be right, in proportion to its score
         offset_m = other.position_m - first.position_m
         covariance += other.score / total_score * np.outer(offset_m, offset_m)
-        if (distance_m := float(np.hypot(*offset_m))) > _MAX_POSITION_SPREAD * pose.footprint_m:
+        if (distance_m := float(np.hypot(*offset_m))) > far_m:
             far_score, farthest_m = far_score + other.score, max(farthest_m, distance_m)
-    if far_score > _MAX_CONTRADICTION_RATIO * sum(estimate.score for estimate in agreeing):
-        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": farthest_m})
+    is_contradicted = far_score > _MAX_CONTRADICTION_RATIO * agreeing_score
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     return Located(
         position=move_position(best.position, float(position_m[0]), float(position_m[1]), best.position.alt_m),
@@ -188,7 +188,7 @@ def locate(
         footprint_m=footprint_m,
         height_m=view.focal and view.focal * footprint_m,
         places=tuple(dict.fromkeys(estimate.place_id for estimate in agreeing)),
-        objection=objection,
+        objection=Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": farthest_m}) if is_contradicted else None,
         attitude_error=error,
     )
 

@@ -10,9 +10,15 @@ from typing import Any
 
 from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.agreement import Agreement, measure_agreement
+from edgevpr.runtime.recognise.agreement import measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks
-from edgevpr.runtime.recognise.parallax import UNLINKED_SHIFT, HeightChange, ParallaxChain, Shift, claim_unseen_change
+from edgevpr.runtime.recognise.parallax import (
+    UNLINKED_SHIFT,
+    HeightChange,
+    ImageMotion,
+    ParallaxChain,
+    claim_unseen_change,
+)
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
 _MIN_INLIERS = 30
@@ -68,53 +74,54 @@ class VisualOdometry:
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
         last, self._previous = self._previous, _Picture(t_s, view, landmarks)
-        found = _compare(last, self._previous) if last and 0 < t_s - last.t_s <= _MAX_ELAPSED_S else None
-        if last is None or found is None:
+        motion = _measure_motion(last, self._previous) if last and 0 < t_s - last.t_s <= _MAX_ELAPSED_S else None
+        if last is None or motion is None:
             return None
-        shift, agreement = found
         start, start_m = last.view, (last.view.footprint_m or 0.0) / last.view.height_scale
-        east, north = picture_axes(start.up_deg or 0.0) @ (shift.offset.real, -shift.offset.imag)
+        east, north = picture_axes(start.up_deg or 0.0) @ (motion.offset.real, -motion.offset.imag)
         self._since_key += complex(east, north)
         missed = self._rate * (last.t_s - self._measured_s)
-        self._measured_s, self._rate = t_s, abs(shift.offset) / (t_s - last.t_s)
+        self._measured_s, self._rate = t_s, abs(motion.offset) / (t_s - last.t_s)
         climb, self._climb = self._climb, HeightChange()  # up to the start of this step
-        height = self._settle(climb, self._follow_height(last, self._previous, shift, missed))
+        height = self._suppress_noise(climb, self._follow_height(last, self._previous, motion, missed))
         return OdometryStep(
             from_s=last.t_s,
             to_s=t_s,
             moved_m=(start_m * float(east), start_m * float(north)),
-            sd_m=start_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
-            inliers=agreement.inliers,
+            sd_m=start_m * motion.offset_sd,
+            inliers=motion.inliers,
             log_height=height.log_ratio,
             log_height_sd=height.sd,
         )
 
-    def _settle(self, *changes: HeightChange) -> HeightChange:
-        """Return the change of height to use: that measured, once it is more than noise, and all that is not seen."""
-        seen_sd = math.hypot(*(change.sd for change in changes if change.log_ratio))
-        unseen_sd = math.hypot(*(change.sd for change in changes if not change.log_ratio))
+    def _suppress_noise(self, *changes: HeightChange) -> HeightChange:
+        """Return the change of height to use: measured ones once their sum is more than noise, assumed ones at once."""
+        measured_sd = math.hypot(*(change.sd for change in changes if change.is_measured))
+        assumed_sd = math.hypot(*(change.sd for change in changes if not change.is_measured))
         log_ratio = self._pending.log_ratio + sum(change.log_ratio for change in changes)
-        self._pending = HeightChange(log_ratio, math.hypot(self._pending.sd, seen_sd))
-        if abs(log_ratio) <= _NOISE_SIGMA * self._pending.sd:
-            return HeightChange(0.0, math.hypot(unseen_sd, seen_sd / 2))
-        settled, self._pending = self._pending, HeightChange()
-        return HeightChange(log_ratio, math.hypot(unseen_sd, settled.sd))
+        sum_sd = math.hypot(self._pending.sd, measured_sd)
+        if abs(log_ratio) <= _NOISE_SIGMA * sum_sd:
+            self._pending = HeightChange(log_ratio, sum_sd)
+            return HeightChange(0.0, math.hypot(assumed_sd, measured_sd / 2))
+        self._pending = HeightChange()
+        return HeightChange(log_ratio, math.hypot(assumed_sd, sum_sd))
 
-    def _follow_height(self, last: _Picture, now: _Picture, shift: Shift, missed: float) -> HeightChange:
+    def _follow_height(self, last: _Picture, now: _Picture, motion: ImageMotion, missed: float) -> HeightChange:
         """Return the change of height since the key picture, if that is far enough away, or steps were `missed`."""
-        share, self._key = abs(self._since_key), (key := self._key or last)
+        self._key = key = self._key or last
+        share = abs(self._since_key)
         if share + missed < _MIN_KEY_SHIFT:
             return HeightChange()
-        found = (shift,) if key is last else _compare(key, now)
+        since_key = motion if key is last else _measure_motion(key, now)
         self._key, self._since_key = now, 0j
-        if found and abs(found[0].offset) >= _MIN_KEY_SHIFT / 2:
-            change, self._climb = self._chain.add(found[0])
+        if since_key and abs(since_key.offset) >= _MIN_KEY_SHIFT / 2:
+            change, self._climb = self._chain.add(since_key)
             return change
         self._chain = ParallaxChain()
         return claim_unseen_change(missed / _UNSEEN_SHIFT + share / UNLINKED_SHIFT)
 
 
-def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:
+def _measure_motion(start: _Picture, now: _Picture) -> ImageMotion | None:
     """Return the motion between two pictures; None if it cannot be measured."""
     one, other = start.view, now.view
     if one.nadir_offset is None or other.nadir_offset is None or one.up_deg is None or other.up_deg is None:
@@ -135,4 +142,5 @@ def _compare(start: _Picture, now: _Picture) -> tuple[Shift, Agreement] | None:
     nadir, start_nadir = (complex(offset[0], -offset[1]) for offset in (other.nadir_offset, one.nadir_offset))
     # The point below the camera in the start picture is that of this picture, rotated, scaled and shifted.
     offset = factor * nadir + complex(*share) - start_nadir
-    return Shift(pairs, (nadir, start_nadir), factor, offset, expected_scale), agreement
+    offset_sd = math.sqrt((agreement.covariance_share2 or (0.0,))[0])
+    return ImageMotion(pairs, (nadir, start_nadir), factor, offset, offset_sd, agreement.inliers, expected_scale)

@@ -14,9 +14,10 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles
 
 _MIN_LANDMARKS = 8
-_MIN_COMMON, _MAX_SPREAD = 4, 0.15  # of the landmarks that three pictures share
+_MIN_COMMON = 4  # landmarks that three pictures share
+_MAX_SPREAD = 0.15  # of the changes that these show
 _TOLERANCE = 0.01  # fraction of the longest side
-_MIN_NEARNESS, _MAX_NEARNESS = 0.4, 2.5
+_MAX_DEPTH_RATIO = 2.5  # of a landmark's depth and the height above ground
 _PIXEL = 0.002  # fraction of the longest side
 # Standard deviation of a measured change: a part of it, and the scatter of landmarks, of which so many err alike.
 _CHANGE_SD = 0.25
@@ -27,56 +28,59 @@ UNLINKED_SHIFT = 2.0  # fraction of the longest side over which any change is po
 
 
 class HeightChange(NamedTuple):
-    """Natural logarithm of the ratio of two heights above ground, and its standard deviation."""
+    """Natural logarithm of the ratio of two heights above ground, measured or assumed, and its standard deviation."""
 
     log_ratio: float = 0.0
     sd: float = 0.0
+    is_measured: bool = True
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
-    """The motion between two pictures, the new one first. `pairs`: matching landmarks, complex (n,) each, fractions of
-    the longest side as in `agreement`; `nadirs`: the points below the camera. By the landmarks, the picture is rotated
-    and scaled by `factor`, and its nadir lies `offset` from the other; `scale`: by the reported heights."""
+class ImageMotion:
+    """The motion between two images, the new one first. `pairs`: matching landmarks, complex (n,) each, fractions of
+    the longest side as in `agreement`; `nadirs`: the points below the camera. By the `inliers` of them, the image is
+    rotated and scaled by `factor`, and its nadir lies `offset` away (`offset_sd`: of each axis); `scale`: reported."""
 
     pairs: tuple[Array, Array]
     nadirs: tuple[complex, complex]
     factor: complex
     offset: complex
+    offset_sd: float
+    inliers: int
     scale: float
 
 
 def claim_unseen_change(part: float) -> HeightChange:
     """Return the change of height to claim where nothing shows it: over this `part` of the way that allows any."""
-    return HeightChange(sd=_UNSEEN_SD * min(1.0, part))
+    return HeightChange(sd=_UNSEEN_SD * min(1.0, part), is_measured=False)
 
 
 class ParallaxChain:
-    """Follows the height above ground over successive shifts, each of which starts at the picture of the last one."""
+    """Follows the height above ground over successive motions, each of which starts at the image of the last one."""
 
     def __init__(self) -> None:
-        self._last: tuple[Array, Doubles] | None = None  # landmarks of the last picture, and their nearness
+        self._last: tuple[Array, Doubles] | None = None  # landmarks of the last image, and their inverse depths
 
-    def add(self, shift: Shift) -> tuple[HeightChange, HeightChange]:
-        """Return by how much the height above ground at this shift differs from that at the last one, and the climb
-        during it, beyond what the reported heights explain (a tilt that is not told changes both, by opposite amounts).
-        Nearness is the height above ground divided by a landmark's depth."""
-        length, turn = abs(shift.offset), shift.factor / abs(shift.factor)
-        axis = shift.offset / length
-        points = turn * (shift.pairs[0] - shift.nadirs[0]) / axis
-        start = (shift.pairs[1] - shift.nadirs[1]) / axis
-        zoom, zoom_sd = _fit_scale(points, start, abs(shift.factor))
+    def add(self, motion: ImageMotion) -> tuple[HeightChange, HeightChange]:
+        """Return the height above ground at this motion relative to that at the last one, and the climb during it,
+        beyond what the reported heights explain. An unreported tilt changes both, by opposite amounts."""
+        length, rotation = abs(motion.offset), motion.factor / abs(motion.factor)
+        axis = motion.offset / length
+        points = rotation * (motion.pairs[0] - motion.nadirs[0]) / axis
+        start = (motion.pairs[1] - motion.nadirs[1]) / axis
+        zoom, zoom_sd = _fit_scale(points, start, abs(motion.factor))
         moved = start - zoom * points
-        nearness = moved.real / length
-        is_plausible = (np.abs(moved.imag) <= _TOLERANCE) & (nearness >= _MIN_NEARNESS) & (nearness <= _MAX_NEARNESS)
-        now, before, nearness = (each[is_plausible] for each in (*shift.pairs, nearness))
-        last, self._last = self._last, (now, nearness)
-        log_zoom = math.log(zoom / shift.scale)
+        inverse_depth = moved.real / length
+        is_valid = (inverse_depth >= 1 / _MAX_DEPTH_RATIO) & (inverse_depth <= _MAX_DEPTH_RATIO)
+        is_valid &= np.abs(moved.imag) <= _TOLERANCE
+        now, before, inverse_depth = (values[is_valid] for values in (*motion.pairs, inverse_depth))
+        last, self._last = self._last, (now, inverse_depth)
+        log_zoom = math.log(zoom / motion.scale)
         climb = HeightChange(log_zoom, math.hypot(zoom_sd / zoom, _CHANGE_SD * log_zoom))
         if last is None:
             return HeightChange(), climb
-        _, here, there = np.intersect1d(before, last[0], return_indices=True)
-        return _compare(last[1][there], nearness[here], length), climb
+        _, rows, last_rows = np.intersect1d(before, last[0], return_indices=True)
+        return _compare_depths(last[1][last_rows], inverse_depth[rows], length), climb
 
 
 def _fit_scale(points: Array, targets: Array, scale: float) -> tuple[float, float]:
@@ -98,13 +102,16 @@ def _fit_scale(points: Array, targets: Array, scale: float) -> tuple[float, floa
     return scale + weight * (fit - scale), math.sqrt(weight * variance)
 
 
-def _compare(before: Doubles, now: Doubles, length: float) -> HeightChange:
-    """Return the change of height that landmarks show by their nearness, (n,), in two shifts."""
+def _compare_depths(before: Doubles, now: Doubles, length: float) -> HeightChange:
+    """Return the change of height that landmarks show by their inverse depths (n,) in two motions."""
+    unseen = claim_unseen_change(length / UNLINKED_SHIFT)
+    if len(before) < _MIN_COMMON:
+        return unseen
     ratios = np.log(now / before)
-    middle = float(np.median(ratios)) if len(ratios) else 0.0
-    spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length) if len(ratios) else 0.0
-    if len(ratios) < _MIN_COMMON or spread > _MAX_SPREAD:
-        return claim_unseen_change(length / UNLINKED_SHIFT)
+    middle = float(np.median(ratios))
+    spread = max(1.5 * float(np.median(np.abs(ratios - middle))), _PIXEL / length)
+    if spread > _MAX_SPREAD:
+        return unseen
     # Their positions are whole pixels, so the median would not see a change of less than one.
     kept = ratios[np.abs(ratios - middle) <= 2.5 * spread]
     scatter = max(float(kept.std()), 0.5 * spread)
