@@ -265,12 +265,9 @@ def read_reason(fields: object) -> Reason | None:
     """Return the reason written as `fields`; None if this version has no such reason."""
     match fields:
         case {"code": str() as name, "parameters": dict() as parameters} if name in ReasonCode.__members__:
-            return Reason(ReasonCode[name], {key: value for key, value in parameters.items() if _is_plain(value)})
+            plain = {key: value for key, value in parameters.items() if type(value) in (int, float, str)}
+            return Reason(ReasonCode[name], plain)
     return None
-
-
-def _is_plain(value: object) -> bool:
-    return isinstance(value, (int, float, str)) and not isinstance(value, bool)
 
 
 def _list_names(part: str) -> list[str]:

@@ -77,8 +77,7 @@ def _change_light(grey: Singles, rng: np.random.Generator, strength: float) -> F
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
         lit = np.asarray(cv2.GaussianBlur(lit, (0, 0), 0.3 + strength * grey.shape[1] / 400), lit.dtype)
-    lit = lit + (0.03 * strength * rng.normal(size=grey.shape)).astype(np.float32)
-    return lit
+    return lit + (0.03 * strength * rng.normal(size=grey.shape)).astype(np.float32)
 
 
 def _cover_patches(grey: Floats, rng: np.random.Generator, strength: float) -> None:

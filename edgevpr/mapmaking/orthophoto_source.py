@@ -188,11 +188,8 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     _require_at_most((end - begin).prod(), _MAX_GRID_POINTS if area else _MAX_PLACES, spacing_m)
     x_m, y_m = (first[axis] + spacing_m * np.arange(begin[axis], end[axis]) for axis in (0, 1))
     y_m = y_m[::-1]
-    if area:
-        is_inside = shapely.contains_xy(ground, x_m[None], y_m[:, None])
-    else:
-        is_inside = np.ones((len(y_m), len(x_m)), bool)
-    rows, columns = np.nonzero(is_inside)
+    everywhere = np.ones((len(y_m), len(x_m)), bool)
+    rows, columns = np.nonzero(shapely.contains_xy(ground, x_m[None], y_m[:, None]) if area else everywhere)
     _require_at_most(len(rows), _MAX_PLACES, spacing_m)
     if not len(rows):
         raise UsageError(

@@ -4,11 +4,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# Images further apart overlap too little for visual odometry on a fixed-wing aircraft. Additional ones are taken
-# between such queries. Two seconds apart, most steps of a turning plane at 22 m/s and 100 m failed, and after a gap the
-# scale is unknown: its estimate was 4.0 m off (median; largest 46), and 3.0 (20) with one second.
-_MAX_QUERY_INTERVAL_S = 4.0
-_ODOMETRY_INTERVAL_S = 1.0
+# Images further apart overlap too little for visual odometry on a fixed-wing aircraft: additional ones are taken
+# between such queries.
+_MAX_QUERY_INTERVAL_S = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +30,7 @@ class Pace:
         self._clock = clock
         self._due_s = clock.mono_s()
         self.rate_hz = self._requested_hz = rate_hz
-        self._odometry_due_s = self._due_s
+        self._last_s = self._due_s  # time of the last frame
 
     def wait_s(self) -> float:
         """Return the seconds until the next frame is due; 0 or less if it is due now."""
@@ -43,13 +41,13 @@ class Pace:
         how far the rate has been lowered."""
         wait_s = 1 / self.rate_hz if step_s is None else step_s * self._requested_hz / self.rate_hz
         self._due_s = max(self._due_s + wait_s, self._clock.mono_s())
-        self._odometry_due_s = self._clock.mono_s() + _ODOMETRY_INTERVAL_S
+        self._last_s = self._clock.mono_s()
 
-    def is_odometry_due(self) -> bool:
-        """Return True, once, if a visual-odometry frame is due between two queries that are far apart."""
+    def is_odometry_due(self, interval_s: float) -> bool:
+        """Return True, once, if a frame for odometry alone is due, `interval_s` after the last, between two queries."""
         now_s = self._clock.mono_s()
-        is_early = now_s < self._odometry_due_s or self._due_s - now_s < _ODOMETRY_INTERVAL_S / 2
+        is_early = now_s < self._last_s + interval_s or self._due_s - now_s < interval_s / 2
         if is_early or self.rate_hz * _MAX_QUERY_INTERVAL_S > 1:
             return False
-        self._odometry_due_s = now_s + _ODOMETRY_INTERVAL_S
+        self._last_s = now_s
         return True

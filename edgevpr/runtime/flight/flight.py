@@ -211,12 +211,11 @@ class Flight:
         return parts.autopilot.check_age(event) if is_live and parts.autopilot and event.accepted else event
 
     def _is_odometry_due(self) -> bool:
-        """Return True if a visual-odometry frame is due. Such frames are taken between queries when queries are
-        infrequent and there is no GPS. In a recording every picture is a query."""
-        parts = self._parts
-        if parts.autopilot is None or not parts.source.is_live or not parts.recogniser.measures_motion:
+        """Return True if a frame for visual odometry alone is due: live, without GPS, between infrequent queries."""
+        parts, interval_s = self._parts, self._parts.recogniser.odometry_interval_s
+        if parts.autopilot is None or not parts.source.is_live or interval_s is None or self._commands.is_paused:
             return False
-        return not self._commands.is_paused and self._pace.is_odometry_due() and parts.autopilot.needs_motion_frames()
+        return self._pace.is_odometry_due(interval_s) and parts.autopilot.needs_motion_frames()
 
     def _publish(self, event: Recognition) -> None:
         """Pass an event to the autopilot and then, with the report of its fix, to all observers. An exception is only

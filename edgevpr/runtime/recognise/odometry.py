@@ -26,6 +26,9 @@ _MIN_INLIER_RATIO = 0.4
 _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictures
 _MAX_SCALE = 1.5
 _MAX_ELAPSED_S = 30.0
+# A second apart, one step in ten of a plane in steep turns failed (25 m/s, 100 m up); half a second apart, none.
+_MIN_INTERVAL_S = 0.5
+_MAX_INTERVAL_S = 2.0
 _NOISE_SIGMA = 2.0  # smaller changes of height are noise: over flat ground, following it doubled the error
 _MIN_KEY_SHIFT = 0.1  # fraction of the longest side
 _UNSEEN_SHIFT = 1.0  # fraction over which any change is possible where pictures do not agree, perhaps because of it
@@ -70,6 +73,13 @@ class VisualOdometry:
         self._since_key = 0j  # moved since then, as a fraction of the picture's longest side: east + 1j * north
         self._chain, self._climb, self._pending = ParallaxChain(), HeightChange(), HeightChange()
         self._measured_s = self._rate = 0.0  # end of the last step, and its length in a second, as such a fraction
+
+    @property
+    def interval_s(self) -> float:
+        """Time until the next frame is needed: until a tenth of the image has moved on, or soon after a missed step."""
+        if self._previous is None or self._measured_s < self._previous.t_s:
+            return _MIN_INTERVAL_S
+        return max(_MIN_KEY_SHIFT / max(self._rate, _MIN_KEY_SHIFT / _MAX_INTERVAL_S), _MIN_INTERVAL_S)
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""

@@ -91,9 +91,9 @@ class Recogniser:
         return self.matcher.search.length if self.matcher.search else 1
 
     @property
-    def measures_motion(self) -> bool:
-        """True if the motion between two frames is measured."""
-        return self._odometry is not None
+    def odometry_interval_s(self) -> float | None:
+        """Time from one frame to the next that visual odometry needs (None: motion is not measured)."""
+        return self._odometry.interval_s if self._odometry else None
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Recognise one frame; `vehicle` is the autopilot's report at that moment (None: no report).
