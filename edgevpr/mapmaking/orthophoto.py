@@ -7,6 +7,7 @@ error if rasterio is missing.
 import logging
 import math
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
@@ -43,6 +44,10 @@ logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each
 _COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
 WGS84 = CRS.from_epsg(4326)
 _WEB_MERCATOR = CRS.from_epsg(3857)
+# In WKT. With the Earth's radius of WGS 84 or GRS 80, or with parameters to WGS 84, the name matters little.
+_UNNAMED_DATUM = re.compile(
+    r'DATUM\["[^"]*(unknown|not.specified)[^"]*",SPHEROID\["[^"]*",(?!6378137)[^]]*(?!\]*,TOWGS84)\]', re.IGNORECASE
+)
 _WEB_MERCATOR_M = 2 * math.pi * 6_378_137.0  # its width
 _ALPHA_SAMPLE_PX = 512
 _MAX_GREY_ALPHA = 0.2  # of the pixels; a mask is grey at the edges of its data at most
@@ -120,6 +125,11 @@ class Orthophoto:
         fault = None
         if not self._data.crs or self._data.transform.is_identity:
             fault = "it has no georeference (coordinate system and position)"
+        elif _UNNAMED_DATUM.search(self._data.crs.to_wkt()):
+            fault = (
+                "its coordinate system names no datum, so it could be off by 100 m or more (name it with `gdal_edit.py "
+                "-a_srs EPSG:...`)"
+            )
         elif ColorInterp.palette in interpretations:
             fault = "its colours are palette indices (convert it with `gdal_translate -expand rgb`)"
         elif not colours or any(dtypes[band - 1] != "uint8" for band in colours):

@@ -108,9 +108,7 @@ def _read_shipped_board(name: str) -> Board:
 def _read_board(path: Path) -> Board:
     board = build(Board, {"name": path.stem, **read_yaml(path)}, str(path))
     if board.full_w < board.idle_w:
-        raise ConfigError(
-            f"{path}: `full_w` ({board.full_w:g}) is below `idle_w` ({board.idle_w:g}): correct one of them."
-        )
+        raise ConfigError(f"{path}: `full_w` ({board.full_w:g}) is below `idle_w` ({board.idle_w:g}): correct them.")
     if not board.budget_mb <= board.memory_max_mb <= board.ram_mb:
         raise ConfigError(
             f"{path}: `budget_mb` ({board.budget_mb:g}) must fit in `memory_max_mb` ({board.memory_max_mb:g}), and "

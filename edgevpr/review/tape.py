@@ -96,9 +96,7 @@ class ReplayedDriver:
                 self._outgoing.clear()
                 conversation.handle_port_loss(*count) if event == "lost" else conversation.end()
             case _:
-                raise EdgevprError(
-                    f"The recording has an unknown link event, {step}: use the version that recorded it."
-                )
+                raise EdgevprError(f"The recording has an unknown link event, {step}: use the version that made it.")
 
 
 class ReplayedSigning(Signing):

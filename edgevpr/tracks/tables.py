@@ -114,9 +114,7 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
         except (KeyError, ValueError) as error:
             raise UsageError(f"{path}: `{' '.join(row):.80}` is invalid ({error}): correct this line.") from error
         if tags_by_path.setdefault((file.parent.name, file.name), tag) != tag:
-            raise UsageError(
-                f"{path} has two different rows for `{file.name}`: keep the one of the image in this folder."
-            )
+            raise UsageError(f"{path} has two different rows for `{file.name}`: keep that of the image in this folder.")
     counts = Counter(name for _, name in tags_by_path)
     tags = {f"{folder}/{name}" if counts[name] > 1 else name: tag for (folder, name), tag in tags_by_path.items()}
     if tags and not any(tag.position for tag in tags.values()):

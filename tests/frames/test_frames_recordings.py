@@ -29,16 +29,12 @@ def write_picture(path):
     path.write_bytes(photographs.encode_image(path.suffix, photographs.draw_picture()))
 
 
-def make_shade(value):
-    return np.full((48, 64, 3), value, np.uint8)
-
-
 @pytest.fixture
 def video(tmp_path):
     path = tmp_path / "flight.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), RATE_HZ, (64, 48))
     for value in SHADES:
-        writer.write(make_shade(value))
+        writer.write(np.full((48, 64, 3), value, np.uint8))
     writer.release()
     return path
 

@@ -10,10 +10,6 @@ from edgevpr.review.logged import FixOutcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 
-def list_outcomes(flight):
-    return [each.fix.outcome for each in flight.queries]
-
-
 def test_read_flight_assigns_a_later_answer_to_its_fix(tmp_path):
     lines = [("query", query(name)) for name in ("a", "b", "c", "d")]
     refused, superseded = ({"code": code, "parameters": {}} for code in ("WRONG_FORM", "SUPERSEDED"))
@@ -23,7 +19,7 @@ def test_read_flight_assigns_a_later_answer_to_its_fix(tmp_path):
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
     names = ["ACCEPTED", "REFUSED", "NOT_SENT", "UNANSWERED"]
-    assert list_outcomes(flight) == [FixOutcome[name] for name in names]
+    assert [each.fix.outcome for each in flight.queries] == [FixOutcome[name] for name in names]
     assert flight.queries[1].fix.why.code is ReasonCode.WRONG_FORM
 
 

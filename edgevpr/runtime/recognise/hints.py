@@ -261,9 +261,7 @@ def explain_why_unusable(
     """Return a sentence that explains why no query can use the hints in `known` (see `RecordedPrior`), else None.
     `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
-        return (
-            f"{sequence} queries are matched together, but `known` applies to single queries: omit one of the options."
-        )
+        return f"{sequence} queries are matched together, but `known` applies to single queries: omit one of them."
     for part, (field, columns) in _REQUIRED_FIELDS.items():
         for name, tags in (("query", queries), ("place", places)):
             if part in known and all(getattr(tag, field) is None for tag in tags):

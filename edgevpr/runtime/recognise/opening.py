@@ -113,9 +113,7 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate
         else:
             _log.warning("`salience.detector` is not set: moving objects are not checked")
     if not (memorability or detector or config.entropy > 0):
-        raise ConfigError(
-            "`salience.use` is true, but every criterion is off: raise a threshold or set `use` to false."
-        )
+        raise ConfigError("`salience.use` is true, but all criteria are off: raise a threshold or set `use` to false.")
     return SalienceGate(config, memorability, detector)
 
 

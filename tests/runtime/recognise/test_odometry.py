@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from levelled_views import draw_ground, take_level_view
+from levelled_views import FOOTPRINT_M, draw_ground, take_level_view
 
 from edgevpr.frames.level import UNKNOWN_VIEW
 from edgevpr.lab.simulate.camera import CameraPose
@@ -31,6 +31,16 @@ def measure_odometry(first, second, after_s=1.0):
     strides = VisualOdometry()
     assert strides.measure(5.0, *first) is None
     return strides.measure(5.0 + after_s, *second)
+
+
+def test_the_next_frame_is_due_when_a_tenth_of_the_view_has_moved_on(ground):
+    first, second = take_view(ground, START), take_view(ground, replace(START, east_m=215.0))
+    elsewhere = take_view(ground, replace(START, east_m=60.0, north_m=330.0))
+    odometry, intervals_s = VisualOdometry(), []
+    for number, view in enumerate([first, first, second, elsewhere]):
+        odometry.measure(5.0 + number, *view)
+        intervals_s.append(odometry.interval_s)
+    assert intervals_s == pytest.approx([0.5, 2.0, FOOTPRINT_M / 10 / 15.0, 0.5], rel=0.05), "soon after a missed step"
 
 
 @pytest.mark.parametrize(
