@@ -35,9 +35,7 @@ def add(commands: Any) -> None:
     shared.add_known(match)
     shared.add_json(match)
 
-    run = shared.add_command(
-        commands, "run", run_flight, "recognise places in flight and send positions to the autopilot"
-    )
+    run = shared.add_command(commands, "run", run_flight, "recognise places in flight, send positions to the autopilot")
     run.add_argument("--config", metavar="FILE", help="configuration file (YAML); flags override it")
     shared.add_keys(run)
     shared.add_positions(run)

@@ -41,9 +41,7 @@ def add(commands: Any) -> None:
     )
     for name, (*_, text) in _NUMBER_FLAGS.items():
         orthophoto.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
-    demo = shared.add_command(
-        commands, "demo", run_demo, "map a generated flight, match a later one, and draw the result"
-    )
+    demo = shared.add_command(commands, "demo", run_demo, "map a generated flight, match a later one, and draw results")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
 
@@ -91,9 +89,7 @@ def run_eval(args: Namespace) -> int:
         f"{sanitize(name)}\n\n{format_results(results)}\n" for name, results in outcome.measured.items() if results
     ]
     shared.print_result(content, args.json, "\n".join(tables))
-    shared.print_notes(
-        *(f"{row} was not evaluated on {name}: {error}" for (name, row), error in outcome.failed.items())
-    )
+    shared.print_notes(*(f"{row} not evaluated on {name}: {error}" for (name, row), error in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 

@@ -97,9 +97,7 @@ def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> No
             text = "every frame of %s becomes a place (%d in %d s): pass --rate-hz 1 to make only %d"
             _log.warning(text, uri, total, duration_s, duration_s)
     if table and (unread := list_unread_columns(table)):
-        text = (
-            "%s: not read: %s; the columns are lat, lon, alt, yaw_deg (or heading_deg), roll_deg, pitch_deg, height_m"
-        )
+        text = "%s: not read: %s; columns: lat, lon, alt, yaw_deg (or heading_deg), roll_deg, pitch_deg, height_m"
         _log.warning(text, table, ", ".join(unread))
     if not has_position:
         _log.warning(

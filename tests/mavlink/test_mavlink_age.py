@@ -45,10 +45,6 @@ def line(narrow_server, clock):
     line.port.close()
 
 
-def make_transmission(clock):
-    return FixTransmission(Fix(50.0, 8.0, 20.0, clock.now_s), clock.now_s + 1.0)
-
-
 def fill_system_buffer(line) -> None:
     """Write until the system holds bytes that the other end does not take."""
     while line.port.unsent() < 2000:
@@ -70,7 +66,7 @@ def drain(port: socket.socket) -> bytes:
 def test_tcp_link_closes_with_an_outdated_fix_in_the_system_buffer(line, clock):
     line, far = line
     fill_system_buffer(line)
-    fix = make_transmission(clock)
+    fix = FixTransmission(Fix(50.0, 8.0, 20.0, clock.now_s), clock.now_s + 1.0)
     line.put(b"the fix", fix)
     line.write()
     assert not line.unsent

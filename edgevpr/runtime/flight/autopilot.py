@@ -145,15 +145,15 @@ class AutopilotOutput:
         and ends, and the delay that is corrected."""
         with self._link.take_turn("age"):
             age = self._navigator.age
-            age.judge(event)
+            may_use = age.judge(event)
         self._unknown_age.update(age.is_unknown)
         if abs(age.delay_s - self._delay_s) > _MIN_REPORTED_DELAY_S:
             self._delay_s = age.delay_s
             note = self._delay_note or Reason(ReasonCode.DELAY_GONE)
             self._notifier.report("age", Severity.INFO, note, delay_s=age.delay_s)
-        if not age.is_unknown:
+        if may_use:
             return event
-        return replace(event, accepted=False, located=None, accuracy_m=None, reason=_UNKNOWN_AGE)
+        return replace(event, accepted=False, located=None, accuracy_m=None, odometry=None, reason=_UNKNOWN_AGE)
 
     @property
     def age_summary(self) -> str | None:

@@ -33,10 +33,6 @@ def accuracies(monkeypatch):
     return table
 
 
-def make_trials(costs):
-    return [Trial(label=label, name=label.split()[0], settings={}, costs=each) for label, each in costs.items()]
-
-
 @pytest.fixture
 def on_this_board(monkeypatch):
     """The estimate is made on the board itself."""
@@ -44,7 +40,8 @@ def on_this_board(monkeypatch):
 
 
 def estimate(costs, plan=PLAN, board=PI):
-    return estimate_flight(board, make_trials(costs), plan)
+    trials = [Trial(label=label, name=label.split()[0], settings={}, costs=each) for label, each in costs.items()]
+    return estimate_flight(board, trials, plan)
 
 
 @pytest.mark.usefixtures("on_this_board")

@@ -69,7 +69,8 @@ class Flight:
         """Update the filter with a query whose best place is `place`; 2.5 is halfway between places 2 and 3. 80
         landmarks agree with it, and `rival` with a place elsewhere."""
         best = round(place)
-        others = [slot for slot in others or _choose_similar(best, len(self.index)) if slot != best]
+        similar = np.random.default_rng(best).permutation(len(self.index))[:SIMILAR_PLACES]
+        others = [slot for slot in others or similar if slot != best]
         slots = np.array([best, *others], int)
         scores = np.array([0.3] + [0.29 if lead < 0.1 else 0.25 if rival else 0.2] * len(others), np.float32)
         compared = {slot: FineMatch(float(score)) for slot, score in zip(slots.tolist(), scores, strict=True)}
@@ -95,10 +96,6 @@ class Flight:
 
     def query_places(self, places, p=0.8, **more):
         return [self.query(place, p, **more) for place in places]
-
-
-def _choose_similar(best, places):
-    return np.random.default_rng(best).choice(places, min(places, SIMILAR_PLACES), replace=False).tolist()
 
 
 def assert_sound(followed):
