@@ -26,6 +26,8 @@ _ROUGH_ERROR = 0.8
 _GPS_LOSS_NOISE_FACTOR = 6.0
 _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
+# After so many such steps in a row, none is used until a fix or GPS: a less certain state would agree after 15 s.
+_MAX_CONTRADICTIONS = 3
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # random change of that error in one second
 # Its heading then drifts too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
@@ -104,6 +106,8 @@ class DriftFilter:
         self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
         self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
+        self._contradictions = 0  # steps of odometry in a row that contradicted the state, since the last fix or GPS
+        self._is_rotated = False  # the image of the last fix, by more than odometry is corrected for
         # Mean square of the attitude errors in the last pictures, divided by their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
         self._attitude_error_sd = _TYPICAL_ATTITUDE_ERROR_SD  # mean of the standard deviations of these errors
@@ -111,14 +115,13 @@ class DriftFilter:
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
         """Start with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
         of its offset and of the velocity error."""
-        self._x = np.zeros(_SIZE)
+        self._x, self._contradictions = np.zeros(_SIZE), 0
         sds = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _ODOMETRY_SD
         self._p = np.diag(np.square(np.append(np.repeat(sds, 2), self._drift.heading_sd)))
 
     @property
     def attitude_error_sd(self) -> float:
-        """Standard deviation of the reported attitude, as a tangent, measured in the last images; 0 if it is within
-        their own errors."""
+        """Standard deviation of the reported attitude, as a tangent, measured in images (0: within their errors)."""
         return self._attitude_error_sd * math.sqrt(max(0.0, self._attitude_error - _CALM_ERROR))
 
     def predict(self, step_s: float, acceleration_m_s2: Doubles) -> None:
@@ -163,6 +166,7 @@ class DriftFilter:
         matrix = self._make_motion_jacobian(age_s)
         errors = offset_m if error_m_s is None else np.concatenate([offset_m, error_m_s])
         variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
+        self._contradictions = 0
         self._correct(matrix[: errors.size], errors, np.diag(variances[: errors.size]))
 
     def add_frame(
@@ -170,11 +174,11 @@ class DriftFilter:
     ) -> bool:
         """Process a frame taken `age_s` ago, and correct the state by the `step` of odometry since the previous frame
         (None: unknown), in which the path moved by `path_moved_m` (2,). `sd_m`: of the frame's position on each axis,
-        without the effect of the attitude error. Returns False if the step contradicts the state and is not used."""
+        without the effect of the attitude error. Returns True if the step agrees with the state and is used."""
         self._frame = position, variance_m2 = self._make_position_jacobian(age_s, attitude_gain_s2), sd_m**2
-        if step is None:
+        if step is None or self._is_rotated or self._contradictions == _MAX_CONTRADICTIONS:
             self._begin_frame()
-            return True
+            return False
         ratio = math.exp(step.log_height)
         self._x[_SCALE] = ratio * (1.0 + self._x[_SCALE]) - 1.0
         self._p[_SCALE] *= ratio
@@ -187,17 +191,19 @@ class DriftFilter:
         x[_F] += np.array(step.moved_m) - path_moved_m
         p[_F, _F] += step.sd_m**2 * _EYE
         if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
+            self._contradictions += 1
             self._begin_frame()
             return False
-        self._x, self._p = x, p
+        self._x, self._p, self._contradictions = x, p, 0
         self._correct(matrix, np.zeros(2), variance_m2 * _EYE)
         return True
 
     def correct_by_rotation(self, rotation: float) -> None:
         """Correct the direction of odometry and the heading by a match whose picture is rotated by `rotation` (radians,
-        clockwise) against the compass. A large rotation is ignored: odometry then contradicts the path and is not used.
+        clockwise) against the compass. After a large rotation, odometry is not used until a match shows a smaller one.
         The motion shows later whether the camera or the compass is rotated."""
-        if abs(rotation) > _MAX_ROTATION_RAD:
+        self._is_rotated = abs(rotation) > _MAX_ROTATION_RAD
+        if self._is_rotated:
             return
         matrix = np.zeros((1, _SIZE))
         matrix[0, _TURN] = matrix[0, _HEADING] = 1.0
@@ -214,6 +220,7 @@ class DriftFilter:
 
     def correct_by_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by the fix of the last frame: its offset (2,) from the path and covariance (2, 2)."""
+        self._contradictions = 0
         self._correct(_FIX, offset_m, covariance_m2)
 
     def correct_by_attitude_error(self, nadir_shift: Doubles, sd: float) -> None:

@@ -162,12 +162,10 @@ def test_px4_without_gps_or_images_gets_nothing_and_the_operator_is_informed():
 
 
 @pytest.mark.parametrize(("unseen_s", "scale"), [(0, 1.4), (0, 0.75), (1, 1.1), (1, 0.92), (4, 1.4), (4, 0.75)])
-@pytest.mark.parametrize(
-    ("vehicle", "parameters"), [("arducopter", GPS_INPUT), ("arduplane", {}), ("px4-copter", SENSOR)]
-)
-def test_cliff_beyond_the_map_is_followed_and_where_it_is_not_seen_claimed(vehicle, parameters, scale, unseen_s):
+@pytest.mark.parametrize(("vehicle", "channel"), [("arducopter", GPS_INPUT), ("arduplane", {}), ("px4-copter", SENSOR)])
+def test_cliff_beyond_the_map_is_followed_and_where_it_is_not_seen_claimed(vehicle, channel, scale, unseen_s):
     """Strides are 1.4 times short beyond it: unseen, 120 to 180 m off in half a minute, 6 to 40 claimed."""
-    flight = ClosedLoop(vehicle, velocity_m_s=12j, **parameters).fly(SETTLED_S)
+    flight = ClosedLoop(vehicle, velocity_m_s=12j, **channel).fly(SETTLED_S)
     flight.set("SIM_GPS1_ENABLE", 0).fly(20)
     flight.matches, flight.show_ground = False, unseen_s == 0
     flight.sees_motion = not unseen_s
@@ -236,6 +234,23 @@ def test_a_plane_gets_no_fix_of_a_single_match_that_nothing_confirms(restarts):
     flight.map_off_m, flight.matches = 0.0, True
     assert flight.fly(5).positions_sent(flight.now_s - 5)
     assert flight.error_m[-1] < 10
+
+
+@pytest.mark.parametrize("turned_deg", [30, 90])
+def test_a_turned_camera_does_not_lead_a_plane_away_after_the_last_match(turned_deg):
+    flight = ClosedLoop("arduplane", velocity_m_s=15j, min_accuracy_m=5.0)
+    flight.heading_error_deg = turned_deg
+    flight.fly(SETTLED_S).set("SIM_GPS1_ENABLE", 0).set("SIM_WIND_SPD", 6).fly(8)
+    flight.matches = False
+    assert flight.fly(32).error_m[-1] < 100
+
+
+def test_odometry_of_a_compass_that_has_jumped_stays_unused_until_a_match():
+    flight = ClosedLoop("arducopter", velocity_m_s=10j, **GPS_INPUT).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(15)
+    flight.matches, flight.heading_error_deg = False, 30.0
+    assert not flight.fly(40).positions_sent(flight.now_s - 30)
+    assert flight.navigator.output is Output.UNKNOWN
 
 
 @pytest.mark.parametrize(("every_s", "fixes"), [(20, 40), (60, 6)])
