@@ -3,9 +3,9 @@ buffer before the timestamp. Only the aircraft's own motion reveals it.
 
 Accepted matches are compared with the motion that the autopilot reports. In turns and at changes of speed, a delay
 shifts and rotates each match as neither wind nor a compass error does. A known delay is subtracted from the time of
-each frame. A match that shows another delay is not used: it may be wrong. If four do, the age of frames is unknown, and
-none is used until the old delay returns or the new one is known. In straight flight at constant speed, matches do not
-show a constant delay: then the claimed error includes the usual delay of such a camera (`Frame.delay_sd_s`).
+each frame. If the delay changes suddenly, the age of frames is unknown, and none is used until the old delay returns or
+the new one is known. In straight flight at constant speed, matches do not show a constant delay: then the claimed error
+includes the delay that is usual for the kind of camera (`Frame.delay_sd_s`).
 """
 
 import math
@@ -48,10 +48,12 @@ _MIN_LEAD_CHI2 = 6.0
 _MAX_DELAY_CHANGE_S = 0.5
 _MIN_OTHER_DELAY_S = 1.5
 _MAX_COMPARED = 12  # number of earlier matches that a match is compared with
+_MAX_GAP_S = 20.0  # between two matches: after a longer one, what the path has drifted looks like a delay
+_OLD_DELAYS_S = np.arange(0.0, 60.0, 0.5)  # of images that may be older than all candidates
 _MAX_DELAY_SD_S = 0.3  # of a known delay
 _MAX_CHI2_PER_MATCH = 3.0  # if all have the same delay
-_MIN_SUSPECTS = 4  # after which the age is unknown: single matches may be wrong, above all off the map
 _MIN_PENDING_MATCHES = 8  # needed to accept another delay
+_FEW_PENDING_MATCHES = 4  # fewer may be wrong, and count only while there are earlier matches
 _PAST_CHI2_WEIGHT = 0.9  # of the matches before the last half minute
 _MIN_AGREEING = 2  # consecutive matches after which the old delay counts as confirmed
 _MAX_OUTLIERS = 3  # consecutive contradictions that no delay explains: then the reported motion is wrong
@@ -111,7 +113,7 @@ class AgeWatch:
         self._motion: deque[tuple[float, ...]] = deque()
         self._origin: Position | None = None
         self._matches: list[TimedMatch] = []
-        self._pending: list[TimedMatch] = []  # of another delay; all since the age became unknown
+        self._pending: list[TimedMatch] = []  # since the age became unknown
         self._delay: Delay | None = None
         self._past_chi2, self._past_until_s = np.zeros(len(DELAYS_S)), -math.inf  # from matches until then
         self._heading_offset_deg, self._heading_offset_s = math.nan, 0.0  # matches minus reports; last update
@@ -154,38 +156,34 @@ class AgeWatch:
         sd_s = math.hypot(delay.sd_s, delay.s - self._applied_delay_s)
         return replace(frame, t_mono_s=frame.t_mono_s - self._applied_delay_s, t_sd_s=math.hypot(frame.t_sd_s, sd_s))
 
-    def judge(self, event: Recognition) -> bool:
-        """Process the accepted match of the frame that `correct` returned last. Returns False if neither the match nor
-        the motion since the frame before must be used."""
+    def judge(self, event: Recognition) -> None:
+        """Process the accepted match of the frame that `correct` returned last. If `is_unknown` is True afterwards, the
+        match must not be used."""
         # Matches older than the stored motion cannot be compared with it.
         from_s = self._motion[0][0] + DELAYS_S[-1] if self._motion else math.inf
         self._matches = [match for match in self._matches if match.t_s >= from_s]
         self._pending = [match for match in self._pending if match.t_s >= from_s][-_MAX_MATCHES:]
         match = self._make_match(event)
         if match is None:
-            return not self.is_unknown
+            return
+        if self._matches and match.t_s - self._matches[-1].t_s > _MAX_GAP_S:
+            self._matches = []
+        self.is_unknown &= bool(self._matches) or len(self._pending) >= _FEW_PENDING_MATCHES
         comparison, match_delay = self._compare(match)
-        is_suspect = comparison is Comparison.OTHER_DELAY
         self._agreeing = self._agreeing + 1 if comparison is Comparison.AGREES else 0
         self._outliers = self._outliers + 1 if comparison is Comparison.OUTLIER else 0
-        if is_suspect or self.is_unknown:
-            self._pending.append(match)
-            self.is_unknown |= len(self._pending) >= _MIN_SUSPECTS
-        elif self._agreeing:
-            self._pending = []
+        self.is_unknown |= comparison is Comparison.OTHER_DELAY
         if self.is_unknown:
+            self._pending.append(match)
             if match_delay and match_delay.sd_s < _MAX_DELAY_CHANGE_S and comparison is not Comparison.OUTLIER:
                 self._matches = [*self._matches[1 - _MAX_MATCHES :], replace(match, delay_s=match_delay.s)]
             self._resume()
         elif self._outliers == _MAX_OUTLIERS:
             self._matches, self._outliers = [match], 0
-        elif self._outliers or is_suspect:
-            return not is_suspect
-        elif not self._matches or match.t_s - self._matches[-1].t_s >= _MIN_INTERVAL_S:
+        elif not self._outliers and (not self._matches or match.t_s - self._matches[-1].t_s >= _MIN_INTERVAL_S):
             self._matches = [*self._matches[1 - _MAX_MATCHES :], match]
             self._update_delay(match.t_s)
             self._update_heading_offset(match)
-        return not self.is_unknown
 
     def _update_delay(self, now_s: float) -> None:
         """Estimate the delay again after a new match."""
@@ -254,12 +252,18 @@ class AgeWatch:
         sd_deg = math.hypot(_DIRECTION_SD_DEG, _HEADING_RANDOM_WALK_DEG * math.sqrt(elapsed_s))
         is_known = math.isfinite(self._heading_offset_deg)
         offset = (self._heading_offset_deg, sd_deg) if is_known else _UNKNOWN_HEADING_OFFSET
-        chi2 = self._compute_chi2([*earlier, match], np.column_stack([delays_s, DELAYS_S]), offset)
-        chi2 = chi2 - self._compute_chi2(earlier, delays_s[:1], offset)  # of this match alone
+        past_chi2 = self._compute_chi2(earlier, delays_s[:1], offset).min()
+        if past_chi2 > _MAX_CHI2_PER_MATCH * len(earlier):  # one of them is wrong
+            return Comparison.UNKNOWN, None
+        chi2 = self._compute_chi2([*earlier, match], np.column_stack([delays_s, DELAYS_S]), offset) - past_chi2
         change_s, own = np.abs(DELAYS_S - usual_s), _estimate_delay(chi2) if chi2.min() < _AGREEMENT_CHI2 else None
         near, far = chi2[change_s <= _MAX_DELAY_CHANGE_S].min(), chi2[change_s > _MIN_OTHER_DELAY_S].min()
         if near > _CONTRADICTION_CHI2:
-            return (Comparison.OTHER_DELAY if chi2.min() < near - _MIN_GAIN_CHI2 else Comparison.OUTLIER), own
+            delays_s = np.tile(earlier_delays_s, (len(_OLD_DELAYS_S), 1))
+            older = self._compute_chi2([*earlier, match], np.column_stack([delays_s, _OLD_DELAYS_S]), offset)
+            best = min(chi2.min(), older.min() - past_chi2)
+            is_late = best < min(_CONTRADICTION_CHI2, near - _MIN_GAIN_CHI2)  # a wrong match fits no delay
+            return (Comparison.OTHER_DELAY if is_late else Comparison.OUTLIER), own
         return (Comparison.AGREES if near < min(_AGREEMENT_CHI2, far - _MIN_LEAD_CHI2) else Comparison.UNKNOWN), own
 
     def _compute_chi2(

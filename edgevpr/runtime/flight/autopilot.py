@@ -145,15 +145,15 @@ class AutopilotOutput:
         and ends, and the delay that is corrected."""
         with self._link.take_turn("age"):
             age = self._navigator.age
-            may_use = age.judge(event)
+            age.judge(event)
         self._unknown_age.update(age.is_unknown)
         if abs(age.delay_s - self._delay_s) > _MIN_REPORTED_DELAY_S:
             self._delay_s = age.delay_s
             note = self._delay_note or Reason(ReasonCode.DELAY_GONE)
             self._notifier.report("age", Severity.INFO, note, delay_s=age.delay_s)
-        if may_use:
+        if not age.is_unknown:
             return event
-        return replace(event, accepted=False, located=None, accuracy_m=None, odometry=None, reason=_UNKNOWN_AGE)
+        return replace(event, accepted=False, located=None, accuracy_m=None, reason=_UNKNOWN_AGE)
 
     @property
     def age_summary(self) -> str | None:
@@ -219,8 +219,7 @@ class AutopilotOutput:
             self._link.send(messages.make_computer_status(now_s, load.core_usage, *ram_bytes, temperature_c))
 
     def _request_source_set(self, is_paused: bool) -> None:
-        """Request another source set if needed. In flight, a set may still be in use that was requested before edgevpr
-        was restarted."""
+        """Request another source set if needed. In flight, one may be in use that was requested before a restart."""
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
         if vehicle is None or not vehicle.is_fresh(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
