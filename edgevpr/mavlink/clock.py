@@ -21,6 +21,7 @@ _MIN_STEP_BACK_S = 1.0  # a boot time that goes back by more than this is that o
 _RESTART_CHECK_S = 3.0  # after a gap in heartbeats; without a boot time in it, the autopilot counts as restarted
 _UTC_ROUNDING_S = 5e-3  # boot times are sent in whole milliseconds
 _MAX_STAMP_ERROR_S = 1.0
+_MAX_AHEAD_S = 0.5
 JITTER_LAG_S = 0.5  # `max_lag_ms` of ArduPilot's JitterCorrection
 _JITTER_SAMPLES = 200  # our timestamps affected by a foreign one: two rounds of `convergence_loops`, the first partial
 # Only messages stamped when they are sent: others carry the time of a measurement, which may be old.
@@ -141,6 +142,13 @@ class AutopilotClock:
         if boot_s is None:
             return 0.0
         return max(math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
+
+    def has_stood_still(self, boot_ms: int, now_s: float) -> bool:
+        """Return True if our monotonic clock stood still, as in a suspended computer: `boot_ms` is in our future."""
+        boot_s = self.boot_time_s(now_s)
+        if boot_s is None or now_s - self._answers[-1].t_s > _MAX_ANSWER_AGE_S:
+            return False
+        return math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3) < -_MAX_AHEAD_S
 
     def _handle_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
         """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""

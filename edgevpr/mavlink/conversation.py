@@ -74,6 +74,7 @@ class Conversation:
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
         self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
+        self._first_due_s = clock() + HEALTH_TIMEOUT_S  # when to report that no heartbeat has arrived
         self._is_gps_silent = self._is_ignored = False  # last announced states
         self._own_report_s = -math.inf  # time of the autopilot's last report of the receiver that we simulate
         self._reported_inputs = 0  # number of GPS_INPUT messages sent until then
@@ -181,6 +182,9 @@ class Conversation:
         elif self._was_alive and not is_alive:
             log.warning("no heartbeat from the autopilot")
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
+        elif self._was_alive is None and not is_alive and now_s > self._first_due_s:
+            self._first_due_s = math.inf
+            log.warning("no heartbeat from an autopilot yet: `edgevpr doctor` shows why")
         if is_alive or self._was_alive is not None:
             self._was_alive = is_alive
         is_gps_silent = self.autopilot.vehicle is not None and self.autopilot.vehicle.gps_is_silent
@@ -194,8 +198,7 @@ class Conversation:
             self.announce(*self._reports.pop(0))
 
     def _check_own_receiver(self) -> None:
-        """Announce if the autopilot does not report the receiver that we simulate, because it uses a new `GPSn_TYPE`
-        only after a reboot, and when it does."""
+        """Announce if the autopilot does not report the receiver that we simulate: it needs a reboot."""
         own_report_s = self.autopilot.own_report_s
         if own_report_s is None or own_report_s != self._own_report_s:  # another channel, a new report, or a restart
             self._own_report_s = -math.inf if own_report_s is None else own_report_s

@@ -18,8 +18,7 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 
 MAX_QUEUED_FIXES = 8
-# Longest time from `put` until a fix is sent, in all buffers together. types.MAX_FIX_AGE_S limits the age of its frame,
-# which is sent with the fix.
+# Longest time from `put` until a fix is sent, in all buffers together. types.MAX_FIX_AGE_S limits the age of its frame.
 MAX_FIX_WAIT_S = 1.0
 MAX_UNANSWERED = 5  # after this many consecutive unanswered fixes, sending stops until one is answered
 RETRY_INTERVAL_S = 10.0  # interval of the fixes sent while sending is stopped

@@ -33,8 +33,7 @@ class Requests:
         self._second_s, self._answered = 0.0, 0
 
     def take(self) -> tuple[UserCommand, str] | None:
-        """Return the newest command received since the last call and its sender, as "SYSTEM_ID/COMPONENT_ID"; None if
-        there is none."""
+        """Return the newest command since the last call (None: none) and its sender, as "SYSTEM_ID/COMPONENT_ID"."""
         waiting, self._waiting = self._waiting, None
         return waiting
 

@@ -135,6 +135,9 @@ class Listener:
     def handle_specific_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Handle the specific force at `t_s` (m/s^2 forward, right and down), and the attitude at that time."""
 
+    def reset_navigation(self) -> None:
+        """Restart navigation, because the vehicle's motion since the last reports is unknown."""
+
     def trusts_gps(self) -> bool:
         """Return False while matches prove the GPS receiver wrong."""
         return True
@@ -276,6 +279,8 @@ class Autopilot:
     def _handle_report(self, message: Message, now_s: float) -> None:
         kind = message.get_type()
         if kind in _TIMED_REPORTS:
+            if self.clock.has_stood_still(message.time_boot_ms, now_s):
+                self._listener.reset_navigation()
             self.report_delay.update(self.clock.delay_s(message.time_boot_ms, now_s), now_s)
         if kind in _MOTION_REPORTS and self.report_delay.is_late:
             return  # an outdated report: the link is saturated, or our process was paused

@@ -49,8 +49,7 @@ class Px4Fusion:
         self, state: MotionState | None, origin: tuple[float, float, float] | None, system_id: int, now_s: float
     ) -> Message | None:
         """Make the message that sends a state (None: unknown) to PX4, which has this system id: ODOMETRY, relative to
-        the `origin` of PX4's local frame (latitude, longitude in degrees, altitude in metres) or, if that is None,
-        message 296."""
+        the `origin` of PX4's local frame (latitude, longitude in degrees, altitude in metres; None: message 296)."""
         if state is None:
             return None
         self._sent_s, self._is_vision = now_s, origin is not None

@@ -75,8 +75,7 @@ class Receivers:
     ) -> Receiver | None:
         """Return the newest report of the most accurate receiver with a fix in the last 2.5 s; None if there is none.
         Of receivers that contradict each other, the one nearest to the autopilot's estimate (`estimate_deg`, latitude
-        and longitude; None: unknown) counts: the autopilot uses it. `own`: message name of the receiver that edgevpr
-        simulates."""
+        and longitude; None: unknown) counts: the autopilot uses it. `own`: message name of the simulated one."""
         real = (tracked for name, tracked in self._tracked.items() if name != own)
         recent = [tracked for tracked in real if now_s - tracked.report.t_s <= GPS_TIMEOUT_S]
         if not recent:

@@ -43,8 +43,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
     def __init__(
         self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
     ) -> None:
-        """Open the link. `own_id`: our component id. `system_id`: system id of the autopilot (None: use that of the
-        first heartbeat). Raises LinkError."""
+        """Open the link. `own_id`: our component id. `system_id`: of the autopilot (None: any). Raises LinkError."""
         self.system_id = system_id
         self.received: Counter[str] = Counter()
         self.signed = 0

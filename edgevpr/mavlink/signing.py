@@ -81,8 +81,7 @@ class TimeStamps:
     def check(self, stream: Stream, stamp: int) -> str | None:
         """Return why a message with this timestamp is rejected, or None if it is admitted. An admitted timestamp is
         stored, so check the signature first. The timestamps of a stream must increase. The first of a new stream must
-        be within a minute of the largest. The very first stream may be ahead: it sets the time of a board without a
-        real-time clock."""
+        be within a minute of the largest. The very first may be ahead: it sets the time of a board without a clock."""
         with self._lock:
             now = max(self._largest, self._now())
             if stamp <= self._streams.get(stream, now - _MAX_STREAM_OFFSET):

@@ -57,8 +57,7 @@ class Attitudes:
             self._history = (*recent[first:], Attitude(now_s, *map(math.degrees, radians)))
 
     def interpolate(self, t_s: float) -> Attitude | None:
-        """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; a single neighbour is returned.
-        None if there is no neighbour."""
+        """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s, or of the only one."""
         history = self._history  # read once, because another thread replaces it
         index = bisect_right(history, t_s, key=_get_time_s)
         nearest = history[max(0, index - 1) : index + 1]

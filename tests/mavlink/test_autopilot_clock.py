@@ -44,6 +44,16 @@ def test_timestamps_are_in_autopilot_time_or_for_px4_in_ours():
     assert odometry.time_usec == pytest.approx(now_s * 1e6, abs=100)
 
 
+def test_navigation_restarts_if_our_clock_has_stood_still():
+    autopilot, restarts = make_autopilot(Channel.GPS_INPUT), []
+    autopilot.conversation.autopilot._listener.reset_navigation = lambda: restarts.append(autopilot.boot_s)
+    for stood_s in (0.0, 6.0):
+        autopilot.wait(1.0)
+        assert not restarts
+        autopilot.send(mavlink.MAVLink_attitude_message(autopilot.boot_ms + int(1e3 * stood_s), 0, 0, 0, 0, 0, 0))
+    assert len(restarts) == 1
+
+
 def test_gps_input_has_boot_time_and_utc_without_link_jitter():
     autopilot = make_autopilot(Channel.GPS_INPUT, lag_s=0.2)
     position, now_s = wait_for_message(autopilot, "GPS_INPUT")
