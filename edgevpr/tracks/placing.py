@@ -16,11 +16,11 @@ from edgevpr.frames.positions import GeoTag, Track
 from edgevpr.frames.video import read_start_s
 from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import Record
-from edgevpr.tracks.triggers import match_triggers
+from edgevpr.tracks.triggers import ZONE_STEP_S, match_triggers
 
-_ZONE_STEP_S = 900  # time zones are multiples of a quarter of an hour
 _MAX_ZONE_STEPS = 4 * 14  # UTC offsets are at most 14 hours
 _MAX_COMPARED = 200  # pictures compared to estimate the clock offset
+_MIN_RELATIVE_FRACTION = 0.9  # of another zone: images taken before the logger started do not show a zone
 _MIN_FRACTION_IN_TRACK = 0.5  # minimum fraction of the pictures that must lie within the track
 _ROUNDING_DEG = 1e-4  # as in subtitles with four decimals
 
@@ -124,14 +124,14 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
 def _estimate_zone_offset_s(track: Track, times_s: Doubles, label: str) -> float:
     """Estimate the time-zone offset to add to a camera clock so that most of its times, float (N,), fall within the
     track: in whole hours, else half hours, else quarter hours."""
-    offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * _ZONE_STEP_S
+    offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * ZONE_STEP_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
     shifted_s = times_s + offsets_s[:, None]
     fractions = ((shifted_s >= first_s) & (shifted_s <= last_s)).mean(axis=1)
     if fractions.max() < _MIN_FRACTION_IN_TRACK:
         raise UsageError(f"The track does not cover {label} in any time zone: {_format_spans(track, times_s)}")
-    best_s = offsets_s[fractions == fractions.max()].tolist()
-    units_s = (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S)
+    best_s = offsets_s[fractions >= _MIN_RELATIVE_FRACTION * fractions.max()].tolist()
+    units_s = (4 * ZONE_STEP_S, 2 * ZONE_STEP_S, ZONE_STEP_S)
     candidates_s = next(filter(None, ([value_s for value_s in best_s if value_s % unit_s == 0] for unit_s in units_s)))
     if len(candidates_s) > 1:
         choices = ", ".join(f"{offset_s:g}" for offset_s in sorted(candidates_s, key=abs)[:4])

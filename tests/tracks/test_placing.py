@@ -88,6 +88,15 @@ def test_match_triggers_goes_by_the_intervals(taken_s, names, triggers_s, placed
     assert ("1 of 6 images without" in how) == (len(placed) < len(images))
 
 
+@pytest.mark.parametrize(("clock_off_s", "is_placed"), [(0, True), (3600, True), (37, False)])
+def test_match_triggers_does_not_shift_images_by_equal_intervals(clock_off_s, is_placed):
+    triggers_s = 1.3 + 2.5 * np.arange(40)
+    images = {f"{t_s:g}": GeoTag(t_utc_s=START_S + int(t_s) + clock_off_s) for t_s in triggers_s[5:]}
+    matched = match_triggers([GeoTag(t_utc_s=START_S + t_s) for t_s in triggers_s], images)
+    assert (matched is not None) == is_placed
+    assert all(f"{tag.t_utc_s - START_S:g}" == name for name, tag in (matched[0] if matched else {}).items())
+
+
 @pytest.mark.parametrize("taken_s", [(1, 2, 3, 9, 11), (0, 1, 2, 3, 4, 5, 6)], ids=["other intervals", "too coarse"])
 def test_match_triggers_refuses_images_of_other_triggers(taken_s):
     images = {f"{t_s}": GeoTag(t_utc_s=START_S + t_s) for t_s in taken_s}
@@ -104,15 +113,15 @@ def test_positions_assigns_images_by_time_if_their_number_differs(capsys, folder
     assert (tag.height_m, tag.t_utc_s) == (pytest.approx(30, abs=0.1), START_S + 7)
 
 
-@pytest.mark.parametrize("hours", [2, -9.5])
-def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours):
+@pytest.mark.parametrize(("hours", "track_s"), [(2, 2600), (-9.5, 700)])
+def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours, track_s):
     folder = tmp_path / "flight"
     folder.mkdir()
-    for number in range(6):
-        write_photograph(folder / f"{number}.jpg", 60 * number + 1, clock_off_s=3600 * hours)
-    write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(0, 400, 2)])
+    for number in range(12):  # the first one before the logger started
+        write_photograph(folder / f"{number}.jpg", 60 * number - 20, clock_off_s=3600 * hours)
+    write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(0, track_s, 2)])
     found = run_json(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
-    assert (found["placed"], found["offset_s"]) == (6, 3600 * hours)
+    assert (found["placed"], found["offset_s"]) == (11, 3600 * hours)
 
 
 def test_positions_refuses_an_ambiguous_time_zone(capsys, folder, tmp_path):

@@ -177,9 +177,8 @@ def test_read_record_says_which_angles_of_a_table_it_does_not_read(tmp_path, col
 
 @pytest.mark.parametrize(("lat_deg", "is_accepted"), [(50.25, True), (50.26, False)])
 def test_read_record_refuses_two_positions_for_a_name(tmp_path, lat_deg, is_accepted):
-    (tmp_path / "table.csv").write_text(
-        f"SourceFile,GPSLatitude,GPSLongitude\nf/a.JPG,50.25,8.5\nf/a.JPG,{lat_deg},8.5\n"
-    )
+    text = f"SourceFile,GPSLatitude,GPSLongitude\nf/a.JPG,50.25,8.5\nf/a.JPG,{lat_deg},8.5\n"
+    (tmp_path / "table.csv").write_text(text)
     with nullcontext() if is_accepted else pytest.raises(UsageError, match=r"two different rows for `a\.JPG`"):
         assert read_record(tmp_path / "table.csv").tags_by_name.keys() == {"a.JPG"}
 
