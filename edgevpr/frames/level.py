@@ -40,8 +40,7 @@ _MAX_SIDE_PX = 1024  # longest side of a warped image: no technique uses more pi
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Fixed angles of the camera from straight down, forward and to the right, relative to the airframe or gimbal
-    (negative: backward, to the left)."""
+    """Fixed angles of the camera from straight down, forward and to the right, relative to airframe or gimbal."""
 
     ahead_deg: float = 0.0
     right_deg: float = 0.0
@@ -71,13 +70,14 @@ class View:
     """Direction, size and offset of an image on the ground (None: unknown).
 
     `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
-    `nadir_offset`: from the image's middle to the nadir, the point straight below the camera, (right, up) as fractions
-    of the longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt
-    (`recognise.relief` adds that due to the height of the ground). `zoom`: factor by which the image was enlarged: its
-    longest side shows that many times less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for
-    an image that was not warped because its lens is unknown. `focal`: focal length as a fraction of the longest side.
-    `rotation_deg`: clockwise rotation that was applied to the image. `height_scale`: factor by which the height that
-    `footprint_m` was computed from had been corrected. `reason`: why a tilted image was not warped."""
+    `nadir_offset`: from the image's middle to the nadir, the point straight below the camera, (right, up) as
+    fractions of the longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large
+    tilt (`recognise.relief` adds that due to the height of the ground). `zoom`: factor by which the image was
+    enlarged: its longest side shows that many times less ground. `nadir_offset_m`: the nadir offset on the ground
+    (east, north), for an image not warped because its lens is unknown, computed from the height `nadir_height_m`.
+    `focal`: focal length as a fraction of the longest side. `rotation_deg`: clockwise rotation that was applied to
+    the image. `height_scale`: factor by which the height that `footprint_m` was computed from had been corrected.
+    `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -85,6 +85,7 @@ class View:
     nadir_offset_sd: float = 0.0
     zoom: float = 1.0
     nadir_offset_m: tuple[float, float] | None = None
+    nadir_height_m: float | None = None
     focal: float | None = None
     rotation_deg: float = 0.0
     height_scale: float = 1.0
@@ -254,7 +255,7 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
     heading = math.radians(heading_deg)
     north = height_m / down * (forward * math.cos(heading) - right * math.sin(heading))
     east = height_m / down * (forward * math.sin(heading) + right * math.cos(heading))
-    return View(nadir_offset_m=(-float(east), -float(north)))
+    return View(nadir_offset_m=(-float(east), -float(north)), nadir_height_m=height_m)
 
 
 class _CameraGeometry:

@@ -239,8 +239,7 @@ def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> t
 
 @show_elapsed("checking for an on-screen display")
 def warn_of_display(pictures: FlightPictures, mask: OverlayMask | None, *, upright: bool) -> None:
-    """Warn if something in the pictures does not move where `mask` shows ground (None: everywhere). `upright` is as in
-    `frames.source.open_source`."""
+    """Warn if something in the pictures does not move where `mask` shows ground. `upright`: see `open_source`."""
     if pictures.folder:
         paths = list_images(pictures.folder)
         indices = np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))

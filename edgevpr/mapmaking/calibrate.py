@@ -154,7 +154,7 @@ def calibrate(
     require(
         place_count >= min_places,
         f"pictures of only {place_count} places were found, but {min_places} are needed; pass the pictures that it was "
-        "made from, with the same camera and mask",
+        "made from, with the same `source.fov_deg` (--fov-deg) or lens, `up_deg` and mask",
     )
     models = {kind: read_default_model(kind) for kind in kinds}
     calibration = _fit_calibration(results, models, config.accept_precision, can_fit=len(index) >= MIN_PLACES)

@@ -68,12 +68,20 @@ def refine_map(
             "straight down. Only maps made with `cohog` and `--camera nadir` can be refined."
         )
     with _require_scipy():
-        from edgevpr.mapmaking.refine import refine
+        from edgevpr.mapmaking.refine import MAX_TURN_DEG, refine
     refined = refine(place_map, technique, progress, images)
     if refined.is_mirrored:
         _log.warning(
             "lat and lon may be swapped, or one has the wrong sign (south and west are negative): the pictures fit the "
             "mirror image of their positions, so %s was not refined; check the columns, then rebuild the map",
+            place_map.path,
+        )
+    if abs(refined.turned_deg) > MAX_TURN_DEG:
+        _log.warning(
+            "pictures fit their positions only if turned by %.0f degrees from their recorded headings: rows may be in "
+            "another order, signs of lat and lon lost, or `source.up_deg` unset, so %s was not refined; correct this, "
+            "then rebuild the map",
+            abs(refined.turned_deg),
             place_map.path,
         )
     if refined.common_offset_m:

@@ -57,8 +57,7 @@ class PlaceSelector:
             yield from self._take_best_waiting()
 
     def _take_best_waiting(self) -> Iterator[SelectedFrame]:
-        """Yield the best waiting frames as low-quality places. Other frames before the last yielded one are dropped;
-        those after it continue to wait."""
+        """Yield the best waiting frames as low-quality places. Others before the last of them are dropped."""
         waiting = [(encoded, encoded.salience) for encoded in self._waiting if encoded.salience]
         best = np.flatnonzero(select_best([salience.shortfall for _, salience in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]

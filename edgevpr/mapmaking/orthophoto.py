@@ -64,9 +64,7 @@ class Orthophoto:
         """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads. Raises SourceError."""
         path = Path(source)
         if not path.exists():
-            raise SourceError(
-                f"{source} does not exist: check the path (`gdal_translate` can save a tile server as a file)."
-            )
+            raise SourceError(f"{source} does not exist: check the path (`gdal_translate` can save a tile server).")
         if path.is_dir():
             raise SourceError(
                 f"{source} is a folder, but must be a file. GDAL can make one from a folder of tiles "
@@ -86,8 +84,7 @@ class Orthophoto:
         self._locate()
 
     def _locate(self) -> None:
-        """Compute where the orthophoto is. Closes the file and raises SourceError if its coordinate system cannot be
-        converted."""
+        """Compute where the orthophoto is. Closes it and raises SourceError if its coordinates cannot be converted."""
         crs = self._data.crs
         self._wrap = 360 if crs.is_geographic else _WEB_MERCATOR_M if crs == _WEB_MERCATOR else 0
         try:
@@ -115,8 +112,7 @@ class Orthophoto:
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))
 
     def _find_colour_bands(self) -> list[int]:
-        """Return the band numbers (from 1) of blue, green and red, or of grey. Closes an unusable file and raises
-        SourceError."""
+        """Return the band numbers (from 1) of blue, green and red, or grey. Raises SourceError for an unusable file."""
         interpretations, dtypes = self._data.colorinterp, self._data.dtypes
         colours = [interpretations.index(colour) + 1 for colour in _COLOURS if colour in interpretations]
         others = [number for number, kind in enumerate(interpretations, start=1) if kind != ColorInterp.alpha]

@@ -11,6 +11,8 @@ available, the technique compares their regions as in flight, which yields a rou
 then compared again near that pose.
 """
 
+import cmath
+import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -35,6 +37,9 @@ from edgevpr.places.mapinfo import find_inconsistent_tags
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVEN_INLIERS, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 
+# Positions turned by half a turn (rows in reversed order, lost signs of both lat and lon) fit the pictures as well.
+MAX_TURN_DEG = 135.0
+_MIN_COMMON_TURN = 0.7  # length of the mean of unit vectors
 _MIN_GROUP = 4  # places connected by ties; three cannot reveal an error in scale
 _MAX_LOG_SD = 0.15  # maximum standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
 # If the misfit between recorded positions and ties exceeds this fraction of their spread, their mirror images are
@@ -85,7 +90,8 @@ class Refinement:
     deviations of refined positions, and of footprints (None: no place).
     `contradictory`: places whose recorded position contradicts the pictures (see `find_inconsistent_tags`): (place id,
     image, metres between recorded and refined position).
-    `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined.
+    `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined. Nor was it if
+    `turned_deg`, the mean angle (clockwise) from recorded headings to those that the ties show, is large.
     `common_offset_m`: median of the distances from images to recorded positions due to an offset that all have in the
     same direction from the camera (see `offset`; None: no such offset). It is part of the claimed accuracy."""
 
@@ -100,6 +106,7 @@ class Refinement:
     footprint_m: float | None = None
     contradictory: tuple[tuple[int, str, float], ...] = ()
     is_mirrored: bool = False
+    turned_deg: float = 0.0
     common_offset_m: float | None = None
 
 
@@ -136,6 +143,8 @@ def refine(
         solution = solve_graph(recorded, _to_ties(ties))
     is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solution)
     refined = _is_determined(solution) & (not is_mirrored)
+    turned_deg = _measure_turn(refinable, solution, refined)
+    refined &= abs(turned_deg) <= MAX_TURN_DEG
     moved_m, footprint_m = abs(solution.position - recorded)[refined], np.exp(solution.log.real)
     members = np.flatnonzero(refined)
     offset = find_common_offset(recorded[refined], solution.position[refined], solution.log[refined])
@@ -155,6 +164,7 @@ def refine(
             for row in np.flatnonzero(find_inconsistent_tags(moved_m))
         ),
         is_mirrored=is_mirrored,
+        turned_deg=turned_deg,
         common_offset_m=float(np.median(offset * footprint_m[refined])) if offset else None,
     )
 
@@ -182,6 +192,17 @@ def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, sol
         mirrored.append(east_m + 1j * north_m)
     limit = _MAX_MIRRORED_RATIO * misfit
     return any(_compute_misfit(image, solve_graph(image, sample_ties), sample) < limit for image in mirrored)
+
+
+def _measure_turn(places: list[Place], solution: GraphSolution, refined: Bools) -> float:
+    """Return the mean angle (degrees, clockwise) from recorded headings to those that the ties show, which follow from
+    the positions; 0.0 if few headings are recorded or the angles differ."""
+    recorded = [(index, place.pose.up_deg) for index, place in enumerate(places) if refined[index] and place.pose]
+    if len(recorded) < _MIN_GROUP:
+        return 0.0
+    indices, ups_deg = np.array(recorded).T
+    mean = np.exp(-1j * (solution.log.imag[indices.astype(int)] + np.radians(ups_deg))).mean()
+    return math.degrees(cmath.phase(mean)) if abs(mean) > _MIN_COMMON_TURN else 0.0
 
 
 def _compute_misfit(recorded: Complexes, solution: GraphSolution, sample: slice) -> float:

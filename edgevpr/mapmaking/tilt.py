@@ -39,8 +39,7 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
     """Return the tilt measured from neighbouring `images`; None if fewer than MIN_PAIRS pairs overlap well, or if the
     tilt is not significant.
 
-    `images` are uint8 (H, W[, 3]), in flight order. `fov_deg` is the field of view along the longest side (None:
-    unknown, TYPICAL_FOV_DEG is assumed)."""
+    `images` are uint8 (H, W[, 3]), in flight order. `fov_deg`: along the longest side (None: TYPICAL_FOV_DEG)."""
     orb = cv2.ORB.create(FEATURES)
     slopes: list[Doubles] = []
     reference: Features | None = None
@@ -95,8 +94,7 @@ def match_features(first: Features, second: Features) -> tuple[Doubles, Doubles]
 
 def _measure_motion(first: Features, second: Features) -> tuple[float, Doubles] | None:
     """Return the motion at the centre between two images, as a fraction of the longest side, and the relative change of
-    the motion per longest side, (2,) to the right and down, which is tan(tilt) / focal length; None if they share too
-    little ground."""
+    the motion per longest side, (2,) to the right and down, tan(tilt) / focal length; None if they share too little."""
     pairs = match_features(first, second)
     if pairs is None:
         return None

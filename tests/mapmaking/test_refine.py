@@ -117,6 +117,16 @@ def test_refine_notices_exchanged_lat_and_lon_and_a_lost_sign(map_path, capsys, 
     assert (refined["refined"], refined["is_mirrored"]) == (0, True)
 
 
+def test_refine_notices_positions_turned_against_the_recorded_headings(map_path, capsys, flown_dir):
+    with PlaceMap.open_for_writing(map_path) as place_map, place_map.transaction():
+        for place, pose in zip(list(place_map.read_places()), flown_dir[1], strict=True):
+            recorded = Pose(up_deg=pose.heading_deg, footprint_m=FOOTPRINT_M, covariance_m2=(9.0, 0.0, 9.0))
+            there = Position(-place.position.lat_deg, -place.position.lon_deg)
+            place_map.move_place(place.place_id, there, recorded)
+    refined = run_json(capsys, "map", "refine", map_path)
+    assert (refined["refined"], abs(refined["turned_deg"])) == (0, pytest.approx(180, abs=8))
+
+
 def test_refine_restarts_from_the_recorded_positions(map_path, capsys):
     def read_positions():
         with PlaceMap.open(map_path) as place_map:

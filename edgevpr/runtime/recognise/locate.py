@@ -105,8 +105,7 @@ def locate_at_place(position: Position, accuracy_m: float) -> Located:
 
 def measure_distance_m(places: Sequence[Candidate], cells: int | None) -> float:
     """Return the distance from the image centre of the first of the matched `places` to that of the query, without
-    poses: if several show the same ground, their positions give the scale. 0.0 if it is unknown. `cells` is as in
-    `locate`."""
+    poses: if several show the same ground, their positions give the scale (unknown: 0.0). `cells`: see `locate`."""
     nearest = _find_centre(places[0].match, cells)
     if nearest is None:
         return 0.0
@@ -164,11 +163,15 @@ def locate(
     min_score = _MIN_SCORE_RATIO * first.score
     agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
     position_m, covariance = _average([other for other in agreeing if other.score >= min_score][:_MAX_PLACES_AVERAGED])
+    footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     if view.nadir_offset_m is not None:
         position_m = position_m + view.nadir_offset_m
+        # The lens is unknown, so the height may be wrong if a usual lens would show other ground from it.
+        doubt = 1.0 - TYPICAL_FOCAL * footprint_m / max(view.nadir_height_m or 0.0, 1.0)
+        covariance += doubt**2 * np.outer(view.nadir_offset_m, view.nadir_offset_m)
     else:
         tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else compute_nadir_sd(view, height_sd)
-        covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
+        covariance += (tilt_sd * footprint_m) ** 2 * np.eye(2)
     others = [estimate for estimate in estimates if estimate.score >= min_score and not first.agrees_with(estimate)]
     agreeing_score = sum(estimate.score for estimate in agreeing)
     total_score, far_m = agreeing_score + sum(other.score for other in others), _MAX_POSITION_SPREAD * pose.footprint_m
@@ -179,7 +182,6 @@ def locate(
         if (distance_m := float(np.hypot(*offset_m))) > far_m:
             far_score, farthest_m = far_score + other.score, max(farthest_m, distance_m)
     is_contradicted = far_score > _MAX_CONTRADICTION_RATIO * agreeing_score
-    footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     return Located(
         position=move_position(best.position, float(position_m[0]), float(position_m[1]), best.position.alt_m),
         covariance_m2=to_triple(covariance),

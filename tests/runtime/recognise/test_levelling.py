@@ -253,6 +253,7 @@ def test_prepare_applies_the_configured_mount_with_and_without_lens_or_gimbal(te
         view = make_levelling(config, technique).prepare(frame, vehicle, None, layers=LAYER).view
         off_m = view.nadir_offset_m if fov_deg is None else FOOTPRINT_M * np.array(view.nadir_offset)
         assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)
+        assert view.nadir_height_m == (HEIGHT_M if fov_deg is None else None), "an unknown lens does not confirm it"
 
 
 @pytest.mark.slow
