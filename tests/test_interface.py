@@ -144,9 +144,8 @@ def test_examples_run(flight, valley, tmp_path, script, more, said):
 def test_film_with_subtitles_example_runs(flight, tmp_path, capsys, caplog):
     (tmp_path / "images").symlink_to(flight / "mapped")
     lines = (flight / "mapped" / "positions.csv").read_text().splitlines()
-    (tmp_path / "positions.csv").write_text(
-        "\n".join([f"{lines[0]},alt,height_m", *(f"{x},250,80" for x in lines[1:])])
-    )
+    rows = [f"{lines[0]},alt,height_m", *(f"{x},250,80" for x in lines[1:])]
+    (tmp_path / "positions.csv").write_text("\n".join(rows))
     film = str(tmp_path / "DJI_0001")
     subprocess.run([sys.executable, EXAMPLES / "film_with_subtitles.py", tmp_path, film], check=True)
     build = ["--images", f"{film}.MP4", "--no-calibrate"]

@@ -76,9 +76,8 @@ def draw_display(picture, rng):
     roll = np.tan(rng.normal(0, 0.2))
     for pitch in range(-3, 4):
         at, half = height // 2 + pitch * height // 10, width // (5 if pitch else 3)
-        cv2.line(
-            picture, (middle[0] - half, int(at - roll * half)), (middle[0] + half, int(at + roll * half)), white, 2
-        )
+        left, right = (middle[0] - half, int(at - roll * half)), (middle[0] + half, int(at + roll * half))
+        cv2.line(picture, left, right, white, 2)
     if rng.random() < 0.5:
         for tick in range(0, height, height // 20):
             cv2.line(picture, (int(0.9 * width), tick), (int((0.92 + 0.02 * (tick % 3)) * width), tick), white, 2)
@@ -94,9 +93,8 @@ def _draw_specks(rng, height, width):
     picture, dark = fill(height, width, int(rng.choice((0, 90, 128, 220)))), rng.random() < 0.5
     for _ in range(int(rng.integers(3, 150))):
         at = int(rng.integers(width)), int(rng.integers(height))
-        cv2.circle(
-            picture, at, int(rng.integers(1, 9)), draw_colour(rng, 0, 100) if dark else draw_colour(rng, 120), -1
-        )
+        radius, colour = int(rng.integers(1, 9)), draw_colour(rng, 0, 100) if dark else draw_colour(rng, 120)
+        cv2.circle(picture, at, radius, colour, -1)
     return cv2.GaussianBlur(picture, (0, 0), 1.5) if rng.random() < 0.5 else picture
 
 

@@ -73,7 +73,7 @@ def _run(argv: list[str]) -> int:
     except ImportError as error:
         return _report_failure(args, error, f"{error}: package missing or broken: reinstall edgevpr on a 64-bit OS.", 1)
     except KeyboardInterrupt:
-        print("edgevpr: stopped; all output confirmed so far is kept.", file=sys.stderr)
+        print("edgevpr: stopped; what was reported as written is kept.", file=sys.stderr)
         return 130
 
 

@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
     shared.add_json(move)
     calibrate = add_to_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
-    calibrate.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and precision are used)")
+    calibrate.add_argument("--config", metavar="FILE", help="configuration (only `source` and precision are used)")
     shared.add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     shared.add_json(calibrate)
     info = add_to_map("info", run_map_info, "print what a map contains, or write it as an HTML page")
@@ -65,7 +65,7 @@ def _add_build(build: ArgumentParser) -> None:
     _add_pictures(build)
     build.add_argument("--technique", metavar="NAME", help="technique (default: cohog)")
     shared.add_parameters(build, "set a parameter of the technique")
-    build.add_argument("--config", metavar="FILE", help="configuration (only camera, mask and salience are used)")
+    build.add_argument("--config", metavar="FILE", help="configuration (only `source` and salience are used)")
     shared.add_keys(
         build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use"
     )

@@ -181,8 +181,7 @@ class Technique(Protocol):
         """Encode an image, uint8 (H, W[, 3]). `mask`: bool (H, W), False for pixels to ignore (None: use all)."""
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape). `mean`: mean of all coarse parts
-        of the map, of `coarse.shape`."""
+        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape). `mean`: of those of the map."""
 
     def score_places(
         self,

@@ -14,8 +14,7 @@ _KERNEL_FILE_BYTES = 1_000_000  # limit for a file in /proc or /sys, where files
 
 
 def find_shipped(kind: str) -> Path:
-    """Return the folder `kind` ("profiles", "models" or "deploy") that is shipped with edgevpr, in the wheel or at the
-    top of the checkout."""
+    """Return the folder `kind` ("profiles", "models" or "deploy") in the wheel or at the top of the checkout."""
     package = Path(__file__).parents[1]
     in_wheel = package / "shipped" / kind
     return in_wheel if in_wheel.is_dir() else package.parent / kind

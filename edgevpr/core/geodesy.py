@@ -49,8 +49,7 @@ def project_to_metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]
 
 
 def offset_position(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tuple[float, float]:
-    """Return the point (lat_deg, lon_deg) that lies `east_m` and `north_m` metres from the given point: the inverse of
-    `offset_m`."""
+    """Return the point (lat_deg, lon_deg) that lies `east_m` and `north_m` metres from a point (see `offset_m`)."""
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
     east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
     return lat_deg + north_deg, wrap_deg(lon_deg + east_deg)
@@ -62,14 +61,12 @@ def offset_between_m(origin: Position, position: Position) -> tuple[float, float
 
 
 def move_position(origin: Position, east_m: float, north_m: float, alt_m: float | None = None) -> Position:
-    """Return the position, at `alt_m`, that lies `east_m` and `north_m` metres from `origin`: the inverse of
-    `offset_between_m`."""
+    """Return the position, at `alt_m`, `east_m` and `north_m` metres from `origin` (see `offset_between_m`)."""
     return Position(*offset_position(origin.lat_deg, origin.lon_deg, east_m, north_m), alt_m)
 
 
 def compute_extent(points: Iterable[LatLon]) -> Extent:
-    """Return the bounding box of points (lat, lon): south, west, north, east. East exceeds 180 degrees if the box
-    crosses the antimeridian."""
+    """Return the bounding box of points (lat, lon): south, west, north, east. East may exceed 180."""
     lats_deg, lons_deg = zip(*points, strict=True)
     if max(lons_deg) - min(lons_deg) > 180:
         lons_deg = tuple(lon_deg % 360 for lon_deg in lons_deg)

@@ -71,8 +71,7 @@ def suggest(name: str, names: Iterable[str], otherwise: str) -> str:
 
 
 def align_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Format rows of cells as a table, one line per row; rows may differ in length. The first `left` columns are
-    left-aligned, the others right-aligned."""
+    """Format rows of cells as a table, one line per row. The first `left` columns are left-aligned."""
     widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
     lines = ([f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row)] for row in rows)
     return ["  ".join(line).rstrip() for line in lines]
@@ -84,8 +83,7 @@ def wrap_sentence(text: str) -> list[str]:
 
 
 def format_json_line(value: Any) -> bytes:
-    """Encode a value as one line of JSON, without passwords. Dataclasses become objects, Enum members their names, NaN
-    and infinities null."""
+    """Encode a value as one line of JSON, without passwords. Enum members become names, NaN and infinities null."""
     text = json.dumps(_to_json(value), ensure_ascii=False, allow_nan=False)
     # Text that is not UTF-8 (a file name) becomes a \u escape, which JSON reads back unchanged.
     return text.encode("utf-8", "backslashreplace") + b"\n"

@@ -174,8 +174,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that the query may show, and the result `match` of comparing the two. Retrieval returns a list of
-    candidates, best first."""
+    """A place that the query may show, and the result `match` of comparing the two."""
 
     place: Place
     match: FineMatch
@@ -206,8 +205,7 @@ NO_COST = StageCost(0.0, 0.0)
 class StepCosts:
     """Costs of the steps of a query: `read` the image, `prepare` it (level it), test its salience (`gate`), `encode`
     it, measure the motion since the previous frame (`odometry`), `scan` all places, `compare` the candidates, `verify`
-    the best one by landmarks, `locate` the aircraft. A step not reached costs nothing; only flights `read` and measure
-    `odometry`."""
+    the best one by landmarks, `locate` the aircraft. Only flights `read` and measure `odometry`."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST

@@ -123,16 +123,14 @@ class VideoDecoder:
     rejected, and so are all later ones until the next key frame, which depends on no other image.
 
     `is_cancelled`: set this to True to end a `fetch` in another thread at the next packet, even an audio packet.
-    `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead during the opening, but not which ones. All
+    `is_backlog_suspect`: FFmpeg reported lost packets while it read ahead during the opening, but not which ones. All
     packets are rejected until this is set to False."""
 
-    def __init__(
-        self, container: InputContainer, is_backlog_doubtful: bool, file: "ResponseFile | None" = None
-    ) -> None:
+    def __init__(self, container: InputContainer, is_backlog_suspect: bool, file: "ResponseFile | None" = None) -> None:
         self.container, self.stream, self._file = container, container.streams.video[0], file
         self.unit_s = float(self.stream.time_base or 1e-6)  # of the timestamps
         self.is_stamped = not container.format.flags & _NO_STAMPS_FLAG
-        self.is_backlog_doubtful = is_backlog_doubtful
+        self.is_backlog_suspect = is_backlog_suspect
         self.is_cancelled = False
         self._codec = self.stream.codec_context
         self._codec.thread_count = 1  # parallel decoding delays images and uses memory
@@ -155,8 +153,7 @@ class VideoDecoder:
         )
 
     def fetch(self) -> TimedPacket | None:
-        """Wait for the next packet and return it; None at the end of the file or if the stream is lost. One thread may
-        fetch while another decodes."""
+        """Wait for the next packet and return it; None at the end, or if the stream is lost."""
         index = self.stream.index
         with av.logging.Capture() as log_lines:
             try:
@@ -182,7 +179,7 @@ class VideoDecoder:
         packet = fetched.packet
         if not packet.size:
             return [] if self._refusal else self._decode_packet(packet)
-        if fetched.is_doubtful or self.is_backlog_doubtful:
+        if fetched.is_doubtful or self.is_backlog_suspect:
             return self._refuse()
         if self._refusal:
             if not packet.is_keyframe:

@@ -46,8 +46,7 @@ class DepthRange:
 
 
 def make_counts_thumbnail(counts: Counts) -> Image:
-    """Return a coarse copy of an image (see `shot.make_thumbnail`), scaled to its own range so that copies of a frozen
-    image are equal."""
+    """Return a coarse copy of an image (see `shot.make_thumbnail`), scaled so that copies of a frozen one are equal."""
     sample = make_thumbnail(counts)
     return to_8_bits(sample, _find_limits(sample))
 

@@ -130,8 +130,7 @@ def _parse_time_s(text: str) -> float:
 def read_xmp(path: str | Path) -> GeoTag:
     """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
     that is absent, damaged or impossible is None. The heading is the direction of the image's top or, if unknown, of
-    the aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is above the take-off
-    point."""
+    the aircraft's nose. Roll and pitch: of the camera, from straight down. The height is above take-off."""
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
         head = handle.read(_HEAD_BYTES)

@@ -243,8 +243,7 @@ def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
 def _make_lens(
     path: str, intrinsics: tuple[float, ...], model: str, coefficients: tuple[float, ...], size_px: tuple[int, int]
 ) -> CalibratedLens:
-    """Make a lens. `model`: its distortion model. `intrinsics`: focal lengths and principal point. Raises ConfigError
-    for an unknown model."""
+    """Make a lens. `model`: its distortion model. `intrinsics`: focal lengths, principal point. Raises ConfigError."""
     focal_x, focal_y, column, row = intrinsics
     if model not in _MODELS:
         raise ConfigError(f"{path} has the distortion model `{model}`: calibrate with one of {', '.join(_MODELS[1:])}.")

@@ -24,8 +24,7 @@ _LATE_REOPEN_S = 30.0  # longer than it takes to estimate a clock's rate
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a source. `text` is for people. `must_reopen`: the fault has lasted so long that the source
-    should be reopened."""
+    """What is wrong with a source. `text` is for people. `must_reopen`: it lasts too long, so reopen the source."""
 
     condition: Condition
     text: str

@@ -51,8 +51,7 @@ _ANGLE_INDICES = [1, 3, 4]  # positions in `_to_numbers` of the angles that wrap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeoTag:
-    """Position, heading, time (seconds since 1970), roll, pitch and height above ground of an image, as defined by
-    `Frame`. None: unknown."""
+    """Position, heading, time (seconds since 1970), roll, pitch and height of an image, as in `Frame`, or None."""
 
     position: Position | None = None
     heading_deg: float | None = None
@@ -187,8 +186,7 @@ def make_position(lat_deg: float, lon_deg: float, alt_m: float | None) -> Positi
 
 
 def _parse_number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in `column` of a row; None if the cell is empty or missing. Raises UsageError for text that is
-    not a number from `low` to `high`."""
+    """Return the number in `column` of a row; None if the cell is empty or missing. Raises UsageError."""
     if not (text := row.get(column)):
         return None
     try:
@@ -259,8 +257,7 @@ class Track:
         )
 
     def require_overlap(self, video: Path, duration_s: float) -> None:
-        """Raise UsageError if the times of the table and of the video, `duration_s` seconds long, do not overlap.
-        `video`: its path, for the message."""
+        """Raise UsageError if the times of the table and of the video, `duration_s` seconds long, do not overlap."""
         if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > duration_s:
             raise UsageError(
                 f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, but {video} runs from 0 "

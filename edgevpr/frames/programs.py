@@ -52,8 +52,7 @@ _log = logging.getLogger(__name__)
 
 
 def require_program(uri: str) -> str:
-    """Return the path of the system program that reads this camera. Raises SourceError if it is not installed, or if
-    `uri` is not a pipeline."""
+    """Return the path of the system program that reads this camera. Raises SourceError if there is none."""
     name = _choose_program(uri)
     if name == _GSTREAMER:
         _split_pipeline(uri)

@@ -76,8 +76,7 @@ class OpeningError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamFacts:
-    """How a stream describes its pictures. `pixel_aspect`: width of a pixel divided by its height. `rate_hz`: picture
-    rate, None if not stated."""
+    """How a stream describes its pictures. `pixel_aspect`: width by height. `rate_hz`: None if not stated."""
 
     codec: str
     bits: int
@@ -91,8 +90,7 @@ class StreamFacts:
 
 
 class Capture:
-    """Base class of open cameras and streams. One thread uses it from opening to release; other threads may only call
-    `cancel`."""
+    """Base class of open cameras and streams. One thread uses it throughout; others may only call `cancel`."""
 
     @property
     def facts(self) -> StreamFacts | None:

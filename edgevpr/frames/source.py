@@ -141,8 +141,7 @@ def read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
 
 
 def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
-    """Return the tags of a folder's images, keyed by path, as a `FolderSource` with these `positions` would. Raises
-    UsageError for an unusable table."""
+    """Return the tags of a folder's images, by path, as `FolderSource` does. Raises UsageError."""
     tags = read_table(folder, positions)
     return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}
 

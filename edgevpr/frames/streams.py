@@ -38,8 +38,7 @@ def open_address(
     uri: str, clock: Callable[[], float], period_s: float, upright: bool = True
 ) -> "StreamCapture | SnapshotCapture":
     """Open a network stream, an .sdp file, or the address of a single image, which is requested every `period_s`
-    seconds and rotated by its EXIF data if `upright`. `clock` is the monotonic clock, in seconds. Raises OpeningError
-    with the cause."""
+    seconds and rotated by its EXIF data if `upright`. `clock`: monotonic. Raises OpeningError with the cause."""
     opened_s = clock()
     response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
     content_type = response.headers.get_content_type() if response else ""
@@ -138,7 +137,7 @@ class StreamCapture(Capture):
         dts = packet.pts if packet.dts is None else packet.dts
         stamped.record_arrival(packet.pts * unit_s, dts * unit_s, arrival.arrival_s, packet.size)
         if stamped.is_live:
-            self._decoder.is_backlog_doubtful = False  # the packets from now on were sent after the opening
+            self._decoder.is_backlog_suspect = False  # the packets from now on were sent after the opening
 
     def _make_shot(self, picture: VideoFrame, unstamped: CaptureTime, arrival_s: float) -> Shot | Refusal:
         taken: CaptureTime | None = unstamped

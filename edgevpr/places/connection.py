@@ -73,8 +73,7 @@ class MapConnection:
 
     @classmethod
     def open_for_writing(cls, path: str | Path) -> "Self":
-        """Open an existing map to add places. Raises the errors of `open`, and MapBusyError if another program has it
-        open for writing."""
+        """Open an existing map to add places. Raises the errors of `open`, and MapBusyError if another program adds."""
         return cls._open(mapfiles.require_map_file(path), is_writable=True)
 
     @classmethod
@@ -150,8 +149,7 @@ class MapConnection:
             yield from rows.scan_rows(self.db, columns)
 
     def read_row(self, place_id: int, columns: str) -> Content:
-        """Return the values of `columns` of one place, by name. Raises PlaceError if the place does not exist or SQLite
-        cannot read its row."""
+        """Return the values of `columns` of one place, by name. Raises PlaceError if it cannot be read."""
         with translate_errors(self.path):
             try:
                 row = self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()

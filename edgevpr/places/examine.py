@@ -51,8 +51,7 @@ class MapCheck:
 
 
 def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterator[PlaceCheck]:
-    """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order in
-    which the places were added."""
+    """Read and check all values of every place, or of those with the ids `only`, in the order of the map."""
     spec = place_map.spec
     unscanned = ((place_id, None) for place_id in sorted(only or ()))
     for place_id, row in place_map.scan_rows(rows.ALL_COLUMNS) if only is None else unscanned:

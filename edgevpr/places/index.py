@@ -86,8 +86,7 @@ def load_index(
 
     If `budget_bytes` (None: no limit) is too small for all, only those chosen by `choose_places` are loaded.
     `extra_bytes` per place are reserved for other arrays that grow with the index (see `sequence`). Places that cannot
-    be read are recorded in `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small
-    for one."""
+    be read are recorded in `PlaceMap.left_out`. Raises MapError if none can be read, or the budget is too small."""
     spec = technique.spec
     places, place_bytes = len(place_map), compute_place_bytes(spec) + extra_bytes
     if not places:

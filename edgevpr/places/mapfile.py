@@ -85,8 +85,7 @@ class PlaceMap(MapConnection):
             return self.insert(content)
 
     def insert(self, content: Content, place_id: int | None = None) -> int:
-        """Insert a row with its checksums, inside a `transaction`; return its id. `place_id` None: SQLite chooses the
-        next id. Raises sqlite3.Error."""
+        """Insert a row with its checksums, inside a `transaction`; return its id. Raises sqlite3.Error."""
         row = {"place_id": place_id, **content, **rows.compute_checksums(content)}
         placeholders = ", ".join("?" * len(row))
         cursor = self.db.execute(f"INSERT INTO places ({', '.join(row)}) VALUES ({placeholders})", tuple(row.values()))
@@ -95,8 +94,7 @@ class PlaceMap(MapConnection):
         return int(cursor.lastrowid or 0)
 
     def move_place(self, place_id: int, position: Position, pose: Pose | None) -> None:
-        """Replace the position and the pose (None: unknown) of an existing place, inside a `transaction`. Raises
-        sqlite3.Error."""
+        """Replace the position and the pose (None: unknown) of a place, in a `transaction`. Raises sqlite3.Error."""
         geom, content = geopackage.encode_point(position.lat_deg, position.lon_deg), rows.make_pose_content(pose)
         # The trigger `places_moved` sets columns to NULL when geom changes, so they are written in a second statement.
         self.db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (geom, place_id))
@@ -111,8 +109,7 @@ class PlaceMap(MapConnection):
         self._record_text("mask_sha256", sha256)
 
     def record_lens(self, path: str | None) -> None:
-        """Store the name of the camera calibration used to undistort the pictures of the places. None: store nothing.
-        Raises MapError."""
+        """Store the name of the camera calibration used to undistort pictures (None: nothing). Raises MapError."""
         if path is not None:
             self._record_text("lens", Path(path).name)
 
@@ -165,8 +162,7 @@ class PlaceMap(MapConnection):
             return rows.decode_part(content, "fine", self.spec.fine), point
 
     def read_landmarks(self, place_id: int) -> bytes | None:
-        """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
-        is missing or damaged."""
+        """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError."""
         with self._convert_row_errors(place_id):
             return rows.read_landmarks(self.read_row(int(place_id), "landmarks, landmarks_crc32"))
 

@@ -135,8 +135,7 @@ def enable_write_ahead_log(db: sqlite3.Connection) -> None:
 
 
 def merge_write_ahead_log(db: sqlite3.Connection) -> None:
-    """Merge the write-ahead log into the map file and remove the log. It stays, without harm, while another program
-    uses the map."""
+    """Merge the write-ahead log into the map file and remove it, unless another program uses the map."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")

@@ -19,8 +19,7 @@ class Ranking:
     (K,). `compared` maps the slot of each place that was compared in full to its match, which has this score; places
     that were only scored quickly (see `Technique.score_quickly`) come last. `unread` int (U,): slots of places that
     cannot be read from the file, but that the query may show, because their scan score (see `Scan`) is at least that of
-    the best place or among the three best. `tried`: fraction (0..1) of the possible rotations of the query that were
-    not ruled out."""
+    the best place or among the three best. `tried`: fraction (0..1) of the rotations of the query that were tried."""
 
     slots: Ints
     scores: Singles
@@ -40,8 +39,7 @@ class Ranking:
 
 
 def merge_rankings(first: Ranking, second: Ranking) -> Ranking:
-    """Merge two rankings of the same query, made with different expectations. If both compared a place in full, keep
-    the better match."""
+    """Merge two rankings of the same query, by other expectations. Of two full comparisons, the better one counts."""
     compared = dict(first.compared)
     for slot, match in second.compared.items():
         if slot not in compared or match.score > compared[slot].score:
@@ -79,8 +77,7 @@ def outside_neighbourhood(
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same_ids: Collection[int] = ()) -> float | None:
-    """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if no such
-    place is ranked."""
+    """Return the best score minus that of the best place elsewhere (see `outside_neighbourhood`; None: none)."""
     is_rival = outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same_ids)
     runners_up = ranking.scores[1:][is_rival]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None

@@ -62,8 +62,7 @@ class SequenceSearch:
     def add_query(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Add the ranking of the newest query, taken at `t_mono_s` (monotonic seconds). Return a ranking of the places
         by the mean score of their best trajectory, with the matches of the newest query. A place that was not compared
-        gets the median score of those that were (0 would score rivals too low); slots before the first place of the map
-        score 0."""
+        gets the median score of those that were (0 is too low for rivals); slots before the first place score 0."""
         if self._is_broken(t_mono_s):
             self._rows.clear()
         if self.frames == self.length:

@@ -27,8 +27,7 @@ class Stage:
 
 @contextmanager
 def meter_stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
-    """Meter a block of code: `with meter_stage() as encoding: ...`, then read `encoding.cost`. The CPU time includes
-    all threads."""
+    """Meter a block of code: `with meter_stage() as encoding: ...`, then `encoding.cost`: CPU time of all threads."""
     stage = Stage()
     wall_s, cpu_s = wall_clock(), cpu_clock()
     try:
@@ -64,8 +63,7 @@ class QueryMeter:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (a field of `StepCosts`): `with meter.step("encode"):`. The costs of a repeated
-        step are summed."""
+        """Meter a step of the query (a field of `StepCosts`): `with meter.step("encode"):`. Repeated steps add up."""
         stage = Stage()
         try:
             with meter_stage(self._wall_clock, self._cpu_clock) as stage:

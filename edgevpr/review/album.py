@@ -161,8 +161,7 @@ def make_album(
     sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({}), *, upright: bool = True
 ) -> Album:
     """Return the album of the pictures in `sources`, folders or one video. `recorded`: files of a recording by frame
-    name, which are searched first. `upright`: see `read_image`. Raises EdgevprError for a source that cannot be
-    used."""
+    name, which are searched first. `upright`: see `read_image`. Raises EdgevprError for an unusable source."""
     finders: list[Finder] = []
     if recorded:
         finders.append(lambda name: _read_picture(recorded[name]) if name in recorded else None)

@@ -110,8 +110,7 @@ def _read_frame(folder: Path, number: int) -> Image:
 
 
 def _drop_unknown_settings(recorded: dict[str, Any], kind: type, prefix: str = "") -> dict[str, Any]:
-    """Return the settings of a recorded flight, of the dataclass `kind`, without those that this version no longer has,
-    with a warning."""
+    """Return the settings of a recorded flight, of the dataclass `kind`, without unknown ones, with a warning."""
     settings, known_names = {}, {key.name for key in list_keys(kind)}
     for name, value in recorded.items():
         key_name = f"{prefix}{name}"

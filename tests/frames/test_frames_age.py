@@ -50,11 +50,9 @@ def simulate_link(taken_s, sizes, bytes_per_s, rng, jitter_s=0.003):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("rate", "from_s"), [(0.48, 4), (0.84, 4), (0.98, 1), (0.9999, 1), (1.0001, 1), (1.05, 1), (2, 7)]
-)
+@pytest.mark.parametrize(("rate", "s"), [(0.48, 4), (0.84, 4), (0.98, 1), (0.9999, 1), (1.0001, 1), (1.05, 1), (2, 7)])
 @pytest.mark.parametrize("rate_hz", [12, 25])
-def test_stamped_time_corrects_timestamps_of_another_rate(rate, from_s, rate_hz):
+def test_stamped_time_corrects_timestamps_of_another_rate(rate, s, rate_hz):
     """Three minutes, with jitter; a camera that stamps 25 pictures a second and delivers 12 has the rate 0.48."""
     rng = np.random.default_rng(1)
     taken_s = np.arange(180 * rate_hz) / rate_hz
@@ -62,7 +60,7 @@ def test_stamped_time_corrects_timestamps_of_another_rate(rate, from_s, rate_hz)
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))
     time = StampedTime()
     ages_s, sds_s = feed_times(time, taken_s, came_s, rate=rate, sizes=sizes)
-    later = taken_s >= from_s
+    later = taken_s >= s
     errors_s = (ages_s - (came_s - taken_s))[later]
     assert not np.isnan(ages_s[later]).any()
     assert np.abs(errors_s).max() < 0.15
@@ -80,10 +78,8 @@ def test_stamped_time_counts_congestion_as_age_and_not_as_clock_drift(slow, last
     rng = np.random.default_rng(2)
     taken_s = np.arange(90 * 25) / 25
     sizes = draw_sizes(len(taken_s), rng, key_factor=key_factor)
-    sent_bytes_per_s = 25 * sizes.mean()
-    came_s = simulate_link(
-        taken_s, sizes, lambda t_s: (slow if 30 <= t_s < 30 + lasts_s else 3) * sent_bytes_per_s, rng
-    )
+    usual_bytes_s = 25 * sizes.mean()
+    came_s = simulate_link(taken_s, sizes, lambda t_s: (slow if 30 <= t_s < 30 + lasts_s else 3) * usual_bytes_s, rng)
     time = StampedTime()
     ages_s, _ = feed_times(time, taken_s, came_s, sizes=sizes)
     is_known = ~np.isnan(ages_s)

@@ -116,15 +116,13 @@ def test_level_image_has_no_nadir_without_an_attitude(ground):
     assert difference(found.image, photograph_above(ground, replace(found.view, nadir_offset=(0, 0))), found.mask) < 0.5
 
 
-@pytest.mark.parametrize(
-    "told", [{}, {"roll_deg": 0.4, "pitch_deg": -0.6}, {"heading_deg": 359.4}, {"height_m": 102.0}]
-)
-def test_level_image_returns_the_same_object_if_nothing_is_known_or_needed(told):
+@pytest.mark.parametrize("its", [{}, {"roll_deg": 0.4, "pitch_deg": -0.6}, {"heading_deg": 359.4}, {"height_m": 102.0}])
+def test_level_image_returns_the_same_object_if_nothing_is_known_or_needed(its):
     image = np.zeros((48, 64), np.uint8)
-    found = level_image(make_frame(image, **told), None, LENS, FOOTPRINT_M)
+    found = level_image(make_frame(image, **its), None, LENS, FOOTPRINT_M)
     assert found.image is image
     assert found.mask is None
-    assert (found.view.up_deg, found.view.reason) == (told.get("heading_deg"), None)
+    assert (found.view.up_deg, found.view.reason) == (its.get("heading_deg"), None)
 
 
 def test_level_image_leaves_a_surveyed_image_unchanged(ground):

@@ -82,9 +82,8 @@ NOSE = 'drone-dji:RelativeAltitude="+39.80" drone-dji:FlightYawDegree="-60.5" dr
 def test_read_xmp_of_each_maker(read, content, heading_deg, roll_deg, pitch_deg, height_m, tmp_path):
     found = read(content)
     expected = (heading_deg, roll_deg, pitch_deg, height_m)
-    for value, wanted in zip(
-        (found.heading_deg, found.roll_deg, found.pitch_deg, found.height_m), expected, strict=True
-    ):
+    values = found.heading_deg, found.roll_deg, found.pitch_deg, found.height_m
+    for value, wanted in zip(values, expected, strict=True):
         assert value == (wanted if wanted is None else pytest.approx(wanted, abs=1e-6))
     assert read_exif(tmp_path / "photo.jpg") == found
 

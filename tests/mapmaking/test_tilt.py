@@ -58,19 +58,17 @@ def test_require_level_refuses_a_tilted_camera_whose_angles_are_not_recorded(gro
         require_level_camera(pictures, None)
 
 
-@pytest.mark.parametrize(
-    ("recorded_deg", "lens"), [(0, None), (0, LENS), (-45, LENS)], ids=["level", "level, lens", "sign"]
-)
-def test_require_level_refuses_a_camera_that_is_tilted_otherwise_than_recorded(ground, tmp_path, recorded_deg, lens):
+@pytest.mark.parametrize(("told_deg", "lens"), [(0, None), (0, LENS), (-45, LENS)], ids=["level", "lens", "sign"])
+def test_require_level_refuses_a_camera_that_is_tilted_otherwise_than_recorded(ground, tmp_path, told_deg, lens):
     lines = ["file,lat,lon,roll_deg,pitch_deg"]
     for number, image in enumerate(fly(ground, 45)):
         cv2.imwrite(str(tmp_path / f"{number:02}.png"), image)
-        lines.append(f"{number:02}.png,50,8,0,{recorded_deg}")
+        lines.append(f"{number:02}.png,50,8,0,{told_deg}")
     pictures = FlightPictures(source=str(tmp_path))
     (tmp_path / "positions.csv").write_text("\n".join(lines))
     with pytest.raises(UsageError, match=r"from the direction given by roll_deg .*gimbal"):
         require_level_camera(pictures, lens)
-    (tmp_path / "positions.csv").write_text("\n".join(lines).replace(f"0,{recorded_deg}", "0,45"))
+    (tmp_path / "positions.csv").write_text("\n".join(lines).replace(f"0,{told_deg}", "0,45"))
     require_level_camera(pictures, LENS)
 
 

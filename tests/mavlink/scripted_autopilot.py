@@ -83,9 +83,8 @@ class Autopilot:
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 if self.timesync_s is not None:
                     self.wait(self.timesync_s)
-                    self.send(
-                        mavlink.MAVLink_timesync_message(round(self.boot_s * 1e9) + 1, message.ts1), address=address
-                    )
+                    answer = mavlink.MAVLink_timesync_message(round(self.boot_s * 1e9) + 1, message.ts1)
+                    self.send(answer, address=address)
             else:
                 self.packets.append(packet)
             if fix:

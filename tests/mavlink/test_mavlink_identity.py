@@ -63,9 +63,8 @@ def test_identity_ignores_a_second_sender_with_the_same_system_id(autopilot, cap
     for _ in range(40):
         autopilot.wait(1.0)
         autopilot.beat(address=THERE)
-        autopilot.send(
-            mavlink.MAVLink_command_ack_message(43003, 0, target_system=7, target_component=197), address=THERE
-        )
+        answer = mavlink.MAVLink_command_ack_message(43003, 0, target_system=7, target_component=197)
+        autopilot.send(answer, address=THERE)
         autopilot.send(mavlink.MAVLink_command_long_message(7, 197, 31010, 0, 1, 0, 0, 0, 0, 0, 0), 255, 190, THERE)
         autopilot.beat()
     assert autopilot.put_fix().sent

@@ -143,9 +143,8 @@ def test_signing_is_compatible_with_pymavlink(key_file, monkeypatch):
     number = free_port()
     signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
     with make_link(f"udpin:127.0.0.1:{number}", signing=signing) as link:
-        other = mavutil.mavlink_connection(
-            f"udpout:127.0.0.1:{number}", dialect="all", source_system=7, source_component=1
-        )
+        url = f"udpout:127.0.0.1:{number}"
+        other = mavutil.mavlink_connection(url, dialect="all", source_system=7, source_component=1)
         other.setup_signing(KEY, sign_outgoing=True)
         with closing(other):
 

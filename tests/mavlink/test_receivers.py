@@ -45,9 +45,7 @@ def test_best_receiver_has_position_velocity_and_altitude_of_its_newest_report()
 @pytest.mark.parametrize(
     ("second_m", "estimate_m", "chosen_m"), [(8.0, 0.0, 8.0), (80.0, 1.0, 0.0), (80.0, 78.0, 80.0), (80.0, None, 80.0)]
 )
-def test_best_of_receivers_that_contradict_each_other_is_the_one_that_the_autopilot_uses(
-    second_m, estimate_m, chosen_m
-):
+def test_best_of_receivers_that_contradict_each_other_is_that_which_the_autopilot_uses(second_m, estimate_m, chosen_m):
     receivers = receive((BEGIN_S, {}))
     lat_deg, lon_deg = offset_position(*HOME, 0.0, second_m)
     position = round(lat_deg * 1e7), round(lon_deg * 1e7), 300_000

@@ -83,9 +83,8 @@ def test_position_is_requested_until_it_arrives(autopilot):
     assert (version.command, version.param1) == (mavlink.MAV_CMD_REQUEST_MESSAGE, 148)
     assert {command.command for command in requests} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
     intervals_us = {int(command.param1): command.param2 for command in requests}
-    assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000, 124: 200_000} | dict.fromkeys(
-        (132, 136, 193), 500_000
-    )
+    slow_us = dict.fromkeys((132, 136, 193), 500_000)
+    assert intervals_us == {33: 100_000, 30: 100_000, 24: 200_000, 124: 200_000} | slow_us
     assert all(command.target_system == 7 for command in requests)
     for _ in range(3):  # what is heard needs no asking, but the version, which it does not say
         autopilot.gps()
@@ -185,11 +184,9 @@ def test_height_uses_the_best_source(autopilot):
         assert autopilot.position().height_m == 80.0, "it is not known there"
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"distance_m": 0.1}, {"distance_m": 120.0}, {"orientation": 0}, {"signal_quality": 1}]
-)
-def test_height_ignores_an_invalid_range(autopilot, wrong):
-    autopilot.range(**{"distance_m": 60.0} | wrong)
+@pytest.mark.parametrize("bad", [{"distance_m": 0.1}, {"distance_m": 120.0}, {"orientation": 0}, {"signal_quality": 1}])
+def test_height_ignores_an_invalid_range(autopilot, bad):
+    autopilot.range(**{"distance_m": 60.0} | bad)
     assert autopilot.position().height_m == 80.0
 
 

@@ -31,9 +31,8 @@ def flight_folder(tmp_path_factory):
     def vehicle():
         lat_deg = 50 + STEP_DEG * (clock() - 1000)
         receiver = make_receiver((lat_deg, 8.00126), 1.0, clock())
-        return make_vehicle(
-            lat_deg, 8.0, clock(), heading_deg=0.0, has_gps=False, gps=receiver, velocity_m_s=(0.0, 111.0)
-        )
+        known = {"heading_deg": 0.0, "has_gps": False, "gps": receiver, "velocity_m_s": (0.0, 111.0)}
+        return make_vehicle(lat_deg, 8.0, clock(), **known)
 
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(folder / "map.gpkg", folder / "flight.jsonl", clock, link, **{"source.rate_hz": 1.0})

@@ -68,9 +68,8 @@ def test_map_page_shows_places_and_their_problems(browser, folder):
 @pytest.mark.slow
 def test_map_page_is_never_written_over_the_map(folder, capsys):
     before = (folder / "valley.gpkg").read_bytes()
-    assert "another output" in expect_refusal(
-        capsys, "map", "info", folder / "valley.gpkg", "--page", folder / "valley.gpkg"
-    )
+    path = folder / "valley.gpkg"
+    assert "another output" in expect_refusal(capsys, "map", "info", path, "--page", path)
     assert (folder / "valley.gpkg").read_bytes() == before
 
 

@@ -63,9 +63,8 @@ class Vehicle:
     def fix(self, north_m: float = 0.0, age_s: float = 0.0, **changes: float) -> int:
         """Send a fix so far north of the truth."""
         lat_deg, lon_deg = displace(self.brain.truth.point, 1j * north_m)
-        command = messages.make_position_fix(
-            Fix(lat_deg, lon_deg, 5.0, self.now_s - age_s), self.now_s, target_system=1
-        )
+        fix = Fix(lat_deg, lon_deg, 5.0, self.now_s - age_s)
+        command = messages.make_position_fix(fix, self.now_s, target_system=1)
         for field, value in changes.items():
             setattr(command, field, value)
         return self.controller.receive(command)[0].result

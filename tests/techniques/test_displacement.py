@@ -105,9 +105,8 @@ def make_pairs(shift, turn_deg, scale, side=SIDE, wrong=0.0, seed=0):
     """Numbers of the regions of a query and of those of the place that they lie on, a part of them wrong."""
     numbers = np.arange(side * side)
     y, x = np.divmod(numbers, side)
-    at = (x - (side - 1) / 2 + 1j * (y - (side - 1) / 2)) * scale * np.exp(1j * math.radians(turn_deg)) + complex(
-        *shift
-    )
+    centred = x - (side - 1) / 2 + 1j * (y - (side - 1) / 2)
+    at = centred * scale * np.exp(1j * math.radians(turn_deg)) + complex(*shift)
     to_x, to_y = (np.rint(part + (SIDE - 1) / 2).astype(int) for part in (at.real, at.imag))
     inside = (to_x >= 0) & (to_x < SIDE) & (to_y >= 0) & (to_y < SIDE)
     best = np.where(inside, to_y * SIDE + to_x, 0)

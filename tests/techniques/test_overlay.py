@@ -43,9 +43,8 @@ def test_overlay_query_follows_the_match(rotation_deg, right_px, down_px, height
         rotation_deg=rotation_deg,
         height_ratio=height,
     )
-    laid, seen = overlay.overlay_query(
-        draw_view(ground, rotation_deg, right_px, down_px, height), ALLOWED, match, CELLS
-    )
+    view = draw_view(ground, rotation_deg, right_px, down_px, height)
+    laid, seen = overlay.overlay_query(view, ALLOWED, match, CELLS)
     assert 0.4 < seen.mean() < 1
     inside = cv2.erode(seen.astype(np.uint8), np.ones((5, 5))).astype(bool)
     assert np.corrcoef(laid[inside], draw_view(ground)[inside])[0, 1] > 0.98

@@ -235,8 +235,7 @@ def read_prior(
 
 
 def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
-    """Recognise the image at `path`, given its `tag`. Raises ModelError if recognition fails, because figures that omit
-    queries would mislead."""
+    """Recognise the image at `path`, given its `tag`. Raises ModelError if it fails: figures without it mislead."""
     event = recogniser.step(
         Frame(
             image=read_image(path, upright=not recogniser.technique.spec.looks_down),

@@ -75,8 +75,7 @@ COSTS: tuple[Column, ...] = (
 
 
 def make_rows(result: TechniqueResult, columns: Sequence[Column], include_in_map: bool = True) -> Iterator[list[str]]:
-    """Yield the row of a result. With `include_in_map`, also yield a row for the queries whose place is in the map, if
-    there are others."""
+    """Yield the row of a result. With `include_in_map`, also yield that of the queries whose place is in the map."""
     yield [result.technique, *(format_cell(result) for _, format_cell in columns)]
     if include_in_map and result.with_match:
         yield [f"{result.technique}, in map", *(format_cell(result.with_match) for _, format_cell in columns)]

@@ -31,8 +31,7 @@ _HEIGHT_M = 80.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeneratedFlight:
-    """A flight with one picture per pose, every `interval_s` seconds from `start_utc`. `seed` generates the clouds and
-    the sensor noise."""
+    """A flight with one picture per pose, every `interval_s` seconds from `start_utc`. `seed`: of clouds and noise."""
 
     poses: tuple[CameraPose, ...]
     light: Light

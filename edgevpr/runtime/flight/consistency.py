@@ -78,8 +78,7 @@ class Consistency:
         return bool(self._agreeing) and now_s - self._agreeing[-1].match.t_s <= timeout_s
 
     def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
-        """Gate a fix by its innovation. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
-        tracked the path."""
+        """Gate a fix by its innovation. `has_gps`: of the autopilot, and trusted; `is_tracked`: by visual odometry."""
         match, innovation_m = fix.match, fix.innovation_m
         heading_agrees = match.heading_agrees_with(self._heading_error_deg)
         sigmas = mahalanobis(innovation_m, match.covariance_m2 + fix.covariance_m2)

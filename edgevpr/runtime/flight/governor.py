@@ -53,9 +53,8 @@ class Change:
 
 
 def list_settings(configured: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
-    """Return the settings from `configured` down to the lowest. First the candidates are lowered to the numbers in
-    `fewer`, largest first, with which no wrong place is accepted; then the rate is halved, down to an eighth, unless
-    `keeps_rate`."""
+    """Return the settings from `configured` down to the lowest: first fewer candidates, by the numbers in `fewer` (with
+    which no wrong place is accepted), then, unless `keeps_rate`, the rate halved, down to an eighth."""
     settings = [configured]
     settings += [replace(configured, candidates=count) for count in fewer if count < configured.candidates]
     while not keeps_rate and settings[-1].rate_hz > configured.rate_hz / _MAX_RATE_DIVISOR:

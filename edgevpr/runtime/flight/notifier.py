@@ -52,8 +52,7 @@ class Notifier:
 
 
 class Alert:
-    """Reports a fault once when it begins (`onset`), and once when it ends (`cleared`). `kind`: kind of its lines in
-    the flight log."""
+    """Reports a fault once when it begins (`onset`), and once when it ends (`cleared`). `kind`: of its log lines."""
 
     def __init__(self, notifier: Notifier, kind: str, onset: Reason, cleared: ReasonCode) -> None:
         self.is_active = False

@@ -64,8 +64,7 @@ class OutputWatch:
         self._sent_s = t_s
 
     def update(self, vehicle: Vehicle, match_s: float, has_gps: bool) -> None:
-        """Process a report from the autopilot. `match_s`: time of the last accepted fix; `has_gps`: there is a trusted
-        receiver."""
+        """Process a report from the autopilot. `match_s`: time of the last fix; `has_gps`: there is a trusted one."""
         now_s = vehicle.t_received_s
         drifts_off = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= INFLUENCE_S
         is_over_gate = (vehicle.innovation_ratio or 0.0) > _MAX_INNOVATION_RATIO

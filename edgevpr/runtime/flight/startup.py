@@ -70,8 +70,7 @@ def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
 
 
 def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str, Any]:
-    """Log the technique in use, and whether the power figures are estimates. Return the fields of the first line of
-    the flight log."""
+    """Log the technique in use, and whether power is estimated. Return the fields of the first line of the log."""
     board = io.board
     _log.info("version %s on %s", __version__, board.title)
     reason = explain_technique(recogniser, is_named=config.technique is not None)

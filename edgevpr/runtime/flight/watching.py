@@ -85,8 +85,7 @@ class MapWatch:
 
 class MapCoverageWatch:
     """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that ends. The
-    map counts as left after many consecutive queries that are not accepted, not counting pictures that cannot be
-    recognised."""
+    map counts as left after many consecutive queries that are not accepted, not counting unusable pictures."""
 
     def __init__(self, notifier: Notifier) -> None:
         self._map = Alert(notifier, "sight", Reason(ReasonCode.MAP_LEFT), ReasonCode.MAP_FOUND)

@@ -21,8 +21,7 @@ from edgevpr.runtime.recognise.landmarks import Landmarks
 
 # Inliers that confirm and prove an agreement. Of 14,799 pairs of a query and a place of another site, expected at the
 # overlay of their match, 31 had four inliers, 7 five, 3 six and none more. Of 50,940 expected on a random overlay, 111
-# had four, 22 five and 2 six. So fewer than one in 10,000 has eight by chance. Without an expectation, 3 of 2500 had
-# seven.
+# had four, 22 five and 2 six. So fewer than one in 10,000 has eight by chance. Without one, 3 of 2500 had seven.
 MIN_CONFIRMED_INLIERS = 8
 MIN_PROVEN_INLIERS = 10
 # Largest deviations from the expected shift (fraction of the longest side), rotation (degrees) and scale (a factor).

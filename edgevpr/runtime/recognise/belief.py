@@ -73,8 +73,7 @@ class Proposals:
 class Posterior:
     """Belief after a query: the probability of being `lost`, the `probability` (K,) of each candidate of the query,
     the one `predicted` (K,) by confirmed hypotheses, and an estimate of the `position` (2,), its `covariance` (2, 2),
-    and the heading (None: unknown). `mass` is the total probability of the hypotheses near it; without any, the
-    estimate is NaN."""
+    and the heading (None: unknown). `mass` is the total probability of the hypotheses near it (none: NaN)."""
 
     lost: float
     probability: Doubles

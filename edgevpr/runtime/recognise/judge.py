@@ -233,8 +233,7 @@ def _refuse(code: ReasonCode, **parameters: float) -> Verdict:
 
 
 def _check_limits(score: float, lead: float | None, rule: AcceptRule) -> Reason | None:
-    """Return the reason if a match is below the least score or lead of `rule`, else None. `lead` is None if there is no
-    place elsewhere."""
+    """Return the reason if a match is below the least score or lead (None: no place elsewhere) of `rule`, else None."""
     min_score = max(rule.min_score, rule.min_verify_score if rule.confidence_rule else 0.0)
     if not score >= min_score:  # `not >=` refuses NaN as well
         return Reason(ReasonCode.LOW_SCORE, {"score": score, "min_score": min_score})

@@ -144,8 +144,7 @@ class PlaceFilter:
     ) -> TrackEstimate:
         """Return the result of one pass combined with the flight so far; nothing is kept until `commit`. `evidence` is
         that of the best place in the `ranking`, and `rule` converts it to probabilities. `located` is the position of
-        the aircraft computed from the best place (None: the position of the place itself is used), and `view` is that
-        of the query."""
+        the aircraft computed from the best place (None: that of the place itself is used); `view`: of the query."""
         if self._geometry is None or self._belief is None:
             self._geometry = _MapGeometry(self._map, index)
             self._belief = Belief(self._geometry.scale)

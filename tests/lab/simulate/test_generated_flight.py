@@ -31,9 +31,8 @@ def test_write_flight_writes_positions_to_a_decimetre(tmp_path, scene):
     tags = read_positions(tmp_path / "positions.csv")
     assert list(tags) == names == sorted(path.name for path in (tmp_path / "images").iterdir())
     for pose, tag in zip(flight.poses, tags.values(), strict=True):
-        assert to_metres(tag.position.lat_deg, tag.position.lon_deg) == pytest.approx(
-            (pose.east_m, pose.north_m), abs=0.1
-        )
+        at_m = to_metres(tag.position.lat_deg, tag.position.lon_deg)
+        assert at_m == pytest.approx((pose.east_m, pose.north_m), abs=0.1)
         assert tag.heading_deg == pytest.approx(pose.heading_deg % 360, abs=0.01)
 
 

@@ -188,9 +188,8 @@ def test_write_hides_the_password_of_the_camera(path):
     config = load_config(None, {"source.uri": "rtsp://pilot:secret@10.0.0.2/cam", "log.path": str(path)})
     spec = TechniqueSpec(name="cohog", parameters={}, coarse=PartSpec((4,), "<f4"))
     with FlightLog(path) as log, PlaceMap.create(path.with_name("m.gpkg"), spec) as place_map:
-        log.write(
-            "start", **start_fields(config, "rpi-5", spec, place_map), source=Path("rtsp://pilot:secret@10.0.0.2")
-        )
+        source = Path("rtsp://pilot:secret@10.0.0.2")
+        log.write("start", **start_fields(config, "rpi-5", spec, place_map), source=source)
         log.write("source", state="rtsp://pilot:secret@10.0.0.2/cam lost")
     assert "secret" not in path.read_text()
     assert next(read_log(path))["config"]["source"]["uri"].startswith("rtsp://pilot:***@")

@@ -43,9 +43,8 @@ class KnownNavigation:
         if self.accuracy_m is None:
             return None
         where = Position(*offset_position(*HOME, *self.off_m))
-        return NavState(
-            t_s=t_s, position=where, velocity_m_s=(3.0, 4.0), accuracy_m=self.accuracy_m, speed_accuracy_m_s=0.5
-        )
+        motion = {"velocity_m_s": (3.0, 4.0), "speed_accuracy_m_s": 0.5}
+        return NavState(t_s=t_s, position=where, accuracy_m=self.accuracy_m, **motion)
 
     def add_frame(self, frame, is_query):
         self.frames.append((frame, is_query))
@@ -171,12 +170,10 @@ def test_continuous_position_claims_the_accuracy_of_fifty_correlated_ones():
     assert (bare.attitude, bare.velocity_m_s[2]) == (None, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("sd_m", "alt_m", "expected_m"), [(1.0, 250.0, 250.0), (1.0, None, 300.0), (20.0, 250.0, 300.0)]
-)
-def test_fallback_position_has_the_altitude_of_the_receiver(sd_m, alt_m, expected_m):
+@pytest.mark.parametrize(("sd_m", "alt_m", "sent_m"), [(1.0, 250.0, 250.0), (1.0, None, 300.0), (20.0, 250.0, 300.0)])
+def test_fallback_position_has_the_altitude_of_the_receiver(sd_m, alt_m, sent_m):
     state = navigate(Channel.GPS_INPUT, reports=receiver(sd_m, alt_m=alt_m)).estimate_state(NOW_S)
-    assert (state.alt_m, state.is_fallback) == (expected_m, sd_m == 1.0)
+    assert (state.alt_m, state.is_fallback) == (sent_m, sd_m == 1.0)
 
 
 @pytest.mark.parametrize(

@@ -60,10 +60,8 @@ def test_flight_reads_the_attitude_at_the_frame_time(place_map, tmp_path):
     assert queries[0]["hints"] == {"reach_m": pytest.approx(111.2, abs=0.1), "heading": True}, "of the autopilot"
 
 
-@pytest.mark.parametrize(
-    ("is_live", "has_gps", "before_s"), [(True, False, 2.0), (True, True, 10.0), (False, False, 10.0)]
-)
-def test_flight_takes_odometry_frames_between_rare_queries_without_gps(place_map, tmp_path, is_live, has_gps, before_s):
+@pytest.mark.parametrize(("is_live", "has_gps", "t_s"), [(True, False, 2.0), (True, True, 10.0), (False, False, 10.0)])
+def test_flight_takes_odometry_frames_between_rare_queries_without_gps(place_map, tmp_path, is_live, has_gps, t_s):
     clock = FakeClock()
 
     def vehicle():
@@ -76,8 +74,8 @@ def test_flight_takes_odometry_frames_between_rare_queries_without_gps(place_map
     lines = flown.fly(source)
     queries = select(lines, "query")
     starts_s = [query["odometry"]["from_s"] - query["t_frame_s"] for query in queries[1:]]
-    assert starts_s[1:] == [pytest.approx(-before_s, abs=0.25)] * (len(queries) - 2)
-    assert len(queries) == (4 if before_s < 10.0 else 21), "the others are no queries"
+    assert starts_s[1:] == [pytest.approx(-t_s, abs=0.25)] * (len(queries) - 2)
+    assert len(queries) == (4 if t_s < 10.0 else 21), "the others are no queries"
     assert not select(lines, "unusable")
     assert flown.end["queries"] == len(queries)
 

@@ -88,11 +88,9 @@ def test_source_sets_keep_a_receiver_that_never_agreed_with_the_map():
     assert flown.fly(3).numbers == []
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"source_sets.gps": 1}, {"source_sets.no_gps": 2}, SETS | {"send_fixes": False}]
-)
-def test_source_sets_request_nothing_without_both_sets_or_in_a_dry_run(settings):
-    flown = AnsweringFlight(**settings)
+@pytest.mark.parametrize("given", [{}, {"source_sets.gps": 1}, {"source_sets.no_gps": 2}, SETS | {"send_fixes": False}])
+def test_source_sets_request_nothing_without_both_sets_or_in_a_dry_run(given):
+    flown = AnsweringFlight(**given)
     flown.lose_gps()
     flown.fly(20).find_gps()
     assert flown.fly(20).numbers == []

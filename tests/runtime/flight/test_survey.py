@@ -120,10 +120,10 @@ def test_survey_standard_deviations_match_the_errors():
 
 
 @pytest.mark.parametrize(
-    ("way", "wrong", "known"), [(fly_circle, 0.0, ["off_m", "ahead_deg"]), (fly_line, 0.05, ["scale"])]
+    ("way", "bad", "known"), [(fly_circle, 0, ["off_m", "ahead_deg"]), (fly_line, 0.05, ["scale"])]
 )
-def test_survey_finds_only_what_the_route_separates(way, wrong, known):
-    found = run_survey(way, 900, wrong=wrong)
+def test_survey_finds_only_what_the_route_separates(way, bad, known):
+    found = run_survey(way, 900, wrong=bad)
     assert [name for name, each in found.measures.items() if each.is_known] == known
     assert (found.fields()["off_m"] is None) == (way is fly_line)
     if way is fly_circle:

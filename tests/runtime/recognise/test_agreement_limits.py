@@ -220,7 +220,6 @@ def test_compose_overlays_leads_from_one_place_to_the_other():
 
 
 def test_relative_pose_is_a_complex_step_and_a_logarithm():
-    assert Overlay((0.1, 0.2), 330.0, 1.5).relative_pose == pytest.approx(
-        (0.1 - 0.2j, math.log(1.5) + 1j * math.pi / 6)
-    )
+    expected = 0.1 - 0.2j, math.log(1.5) + 1j * math.pi / 6
+    assert Overlay((0.1, 0.2), 330.0, 1.5).relative_pose == pytest.approx(expected)
     assert Overlay((0.1, 0.2), 0.0).relative_pose[1] == 0

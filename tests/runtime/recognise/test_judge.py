@@ -52,9 +52,8 @@ def test_judge_accepts_a_match_from_the_required_confidence(confidence, accepted
     assert verdict.reason.code is (ReasonCode.ACCEPTED_BY_CONFIDENCE if accepted else ReasonCode.LOW_CONFIDENCE)
     figures = {"confidence": confidence, "min_confidence": 0.9, "regions_ratio": math.exp(CLEAR.lead)}
     assert {name: verdict.reason.parameters[name] for name in figures} == pytest.approx(figures, nan_ok=True)
-    assert decide((0.2,), make_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
-        "no place elsewhere"
-    )
+    alone = decide((0.2,), make_rule(lambda evidence: confidence), evidence=CLEAR)
+    assert alone.accepted is accepted, "no place elsewhere"
 
 
 @pytest.mark.parametrize(
@@ -263,9 +262,8 @@ def test_is_unshifted_requires_no_shift_rotation_or_height_change(shift_cells, r
 def test_judge_requires_landmarks_against_a_place_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
     evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
-    verdict = decide(
-        (0.15, 0.14), make_rule(lambda evidence: 1.0), agreement=make_agreement(inliers), evidence=evidence
-    )
+    rule, agreement = make_rule(lambda evidence: 1.0), make_agreement(inliers)
+    verdict = decide((0.15, 0.14), rule, agreement=agreement, evidence=evidence)
     assert verdict.accepted is accepted
     parameters = verdict.reason.parameters
     assert (parameters["landmarks"], parameters["rival_landmarks"]) == (inliers, rival)

@@ -94,11 +94,9 @@ def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
 
 
 @pytest.mark.parametrize("vehicle", ["copter", "rover", "vehicle"])
-@pytest.mark.parametrize(
-    "parameters", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}]
-)
-def test_check_autopilot_requires_a_second_receiver_without_another_source(vehicle, parameters):
-    found = find_faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | parameters))
+@pytest.mark.parametrize("changes", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}])
+def test_check_autopilot_requires_a_second_receiver_without_another_source(vehicle, changes):
+    found = find_faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | changes))
     assert found == {"channel": ("GPS2_TYPE=14",)}
     assert find_faults(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
 
