@@ -96,7 +96,7 @@ def test_match_skips_a_query_that_is_not_memorable(recording, tmp_path, capsys):
     ("keys", "code", "complaint"),
     [
         ({"entropy": 0.8}, 2, "0.792"),
-        ({"entropy": 0}, 2, "every criterion"),
+        ({"entropy": 0}, 2, "all criteria"),
         ({"memorability": 0.5, "network": "tiny"}, 1, "has no `outputs.memorability`"),
         ({"staticity": 0.5, "detector": "bright"}, 1, "is not a detector"),
     ],
