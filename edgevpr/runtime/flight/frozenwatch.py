@@ -216,11 +216,10 @@ class FrozenWatch:
             return
         velocity_m_s = _read_velocity(now.vehicle)
         is_flying = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
-        # The horizon ahead looks the same for a long time.
-        if is_flying and self._optics.looks_down and not now.has_returned_to(earlier):
-            self._repeats_in_a_row += 1
-        rotation_motion = self._optics.compute_rotation_motion(earlier.vehicle, now.vehicle)
-        motion = max(rotation_motion, self._optics.compute_travel_motion(earlier, now, _PATH_DRIFT_M_S))
+        motion = self._optics.compute_rotation_motion(earlier.vehicle, now.vehicle)
+        if self._optics.looks_down and not now.has_returned_to(earlier):  # the horizon ahead looks the same for long
+            self._repeats_in_a_row += is_flying
+            motion = max(motion, self._optics.compute_travel_motion(earlier, now, _PATH_DRIFT_M_S))
         if motion >= MIN_MOTION:
             self._repeats.append((now.t_s, min(motion, _MAX_SINGLE_MOTION)))
 
