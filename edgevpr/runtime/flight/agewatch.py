@@ -48,12 +48,9 @@ _MIN_LEAD_CHI2 = 6.0
 _MAX_DELAY_CHANGE_S = 0.5
 _MIN_OTHER_DELAY_S = 1.5
 _MAX_COMPARED = 12  # number of earlier matches that a match is compared with
-_MAX_GAP_S = 20.0  # between two matches: after a longer one, what the path has drifted looks like a delay
-_OLD_DELAYS_S = np.arange(0.0, 60.0, 0.5)  # of images that may be older than all candidates
 _MAX_DELAY_SD_S = 0.3  # of a known delay
 _MAX_CHI2_PER_MATCH = 3.0  # if all have the same delay
 _MIN_PENDING_MATCHES = 8  # needed to accept another delay
-_FEW_PENDING_MATCHES = 4  # fewer may be wrong, and count only while there are earlier matches
 _PAST_CHI2_WEIGHT = 0.9  # of the matches before the last half minute
 _MIN_AGREEING = 2  # consecutive matches after which the old delay counts as confirmed
 _MAX_OUTLIERS = 3  # consecutive contradictions that no delay explains: then the reported motion is wrong
@@ -166,9 +163,6 @@ class AgeWatch:
         match = self._make_match(event)
         if match is None:
             return
-        if self._matches and match.t_s - self._matches[-1].t_s > _MAX_GAP_S:
-            self._matches = []
-        self.is_unknown &= bool(self._matches) or len(self._pending) >= _FEW_PENDING_MATCHES
         comparison, match_delay = self._compare(match)
         self._agreeing = self._agreeing + 1 if comparison is Comparison.AGREES else 0
         self._outliers = self._outliers + 1 if comparison is Comparison.OUTLIER else 0
@@ -252,18 +246,12 @@ class AgeWatch:
         sd_deg = math.hypot(_DIRECTION_SD_DEG, _HEADING_RANDOM_WALK_DEG * math.sqrt(elapsed_s))
         is_known = math.isfinite(self._heading_offset_deg)
         offset = (self._heading_offset_deg, sd_deg) if is_known else _UNKNOWN_HEADING_OFFSET
-        past_chi2 = self._compute_chi2(earlier, delays_s[:1], offset).min()
-        if past_chi2 > _MAX_CHI2_PER_MATCH * len(earlier):  # one of them is wrong
-            return Comparison.UNKNOWN, None
-        chi2 = self._compute_chi2([*earlier, match], np.column_stack([delays_s, DELAYS_S]), offset) - past_chi2
+        chi2 = self._compute_chi2([*earlier, match], np.column_stack([delays_s, DELAYS_S]), offset)
+        chi2 = chi2 - self._compute_chi2(earlier, delays_s[:1], offset)  # of this match alone
         change_s, own = np.abs(DELAYS_S - usual_s), _estimate_delay(chi2) if chi2.min() < _AGREEMENT_CHI2 else None
         near, far = chi2[change_s <= _MAX_DELAY_CHANGE_S].min(), chi2[change_s > _MIN_OTHER_DELAY_S].min()
         if near > _CONTRADICTION_CHI2:
-            delays_s = np.tile(earlier_delays_s, (len(_OLD_DELAYS_S), 1))
-            older = self._compute_chi2([*earlier, match], np.column_stack([delays_s, _OLD_DELAYS_S]), offset)
-            best = min(chi2.min(), older.min() - past_chi2)
-            is_late = best < min(_CONTRADICTION_CHI2, near - _MIN_GAIN_CHI2)  # a wrong match fits no delay
-            return (Comparison.OTHER_DELAY if is_late else Comparison.OUTLIER), own
+            return (Comparison.OTHER_DELAY if chi2.min() < near - _MIN_GAIN_CHI2 else Comparison.OUTLIER), own
         return (Comparison.AGREES if near < min(_AGREEMENT_CHI2, far - _MIN_LEAD_CHI2) else Comparison.UNKNOWN), own
 
     def _compute_chi2(

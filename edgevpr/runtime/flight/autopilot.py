@@ -145,7 +145,8 @@ class AutopilotOutput:
         and ends, and the delay that is corrected."""
         with self._link.take_turn("age"):
             age = self._navigator.age
-            age.judge(event)
+            if not self._navigator.is_out_of_reach(event):
+                age.judge(event)
         self._unknown_age.update(age.is_unknown)
         if abs(age.delay_s - self._delay_s) > _MIN_REPORTED_DELAY_S:
             self._delay_s = age.delay_s

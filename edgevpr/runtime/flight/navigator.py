@@ -6,7 +6,7 @@ The link calls it in its own thread, the loop of `flight` (through `autopilot`) 
 import math
 from dataclasses import dataclass, replace
 
-from edgevpr.core.geodesy import distance_m, offset_position
+from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
@@ -37,6 +37,9 @@ _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
 _MAX_CONTINUOUS_ERROR_M = 25.0
 # Nor is a continuous one of unknown velocity: at 13 m/s it fell 40 m behind, and took 15 s to catch up without a jump.
 _MAX_SPEED_ERROR_M_S = 6.0  # unknown: 10; in a hover by poor gyros, without a measured tilt: up to 3
+# A match that is farther away than the way flown in this time is not of a late image, but of another place.
+_MAX_DELAY_S = 10.0
+_MIN_SPEED_M_S = 10.0
 _MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long after the last match, odometry or GPS
 # From accelerations alone we know no more than the autopilot, which has them too, and dead-reckons for some seconds
 # itself. So a continuous position ends this long after the last picture with a match or odometry or, until there is
@@ -169,6 +172,15 @@ class Navigator(Listener):
         Odometry between frames of unknown age is of an unknown time, so they are not used."""
         if not self.age.is_unknown and (frame := self._measure(event)):
             self._navigation.add_frame(frame, is_query)
+
+    def is_out_of_reach(self, event: Recognition) -> bool:
+        """Return True if a match is so far from our position that no delay of its image explains it: it is wrong."""
+        estimate = self._navigation.estimate_state(event.frame.t_mono_s) if event.frame else None
+        if estimate is None or event.located is None or not self._navigation.is_confirmed:
+            return False
+        way_m = _MAX_DELAY_S * max(_MIN_SPEED_M_S, math.hypot(*estimate.velocity_m_s))
+        away_m = math.hypot(*offset_between_m(estimate.position, event.located.position))
+        return away_m > way_m + 4 * (estimate.accuracy_m + event.located.accuracy_m)
 
     def report_accuracy(self, event: Recognition) -> Recognition:
         """Return an event with the accuracy of its match in flight, which includes the errors of attitude and time."""

@@ -57,7 +57,7 @@ class LateCameraFlight(SimFlight):
         heading_deg = self.heading_deg(true_step * STEP_S) + self.rng.normal(0, 1.0)
         event = replace(event, frame=frame, picture=picture, located=replace(event.located, heading_deg=heading_deg))
         self.off_s, self.t_sd_s = frame.t_mono_s - true_step * STEP_S, frame.t_sd_s
-        age.judge(event)
+        _ = self.navigator.is_out_of_reach(event) or age.judge(event)
         if age.is_unknown:
             self.refused.append(self.t_s)
             return Advice(None, Reason(ReasonCode.AGE_UNKNOWN))
@@ -120,7 +120,7 @@ def test_age_watch_refuses_suddenly_late_images_until_the_delay_is_as_before(pat
     assert max(air.errors_sd, default=0.0) < 3
 
 
-def test_age_watch_does_not_take_a_wrong_match_for_a_late_one(monkeypatch):
+def test_match_out_of_reach_is_not_taken_for_a_late_one(monkeypatch):
     air = LateCameraFlight(**CIRCLE)
     monkeypatch.setitem(globals(), "HOME", (HOME[0] + 0.005, HOME[1]))
     air.fly(1)
