@@ -92,9 +92,7 @@ def _add_subset(parser: ArgumentParser) -> None:
         default=_MISSION_MARGIN_M,
         help="margin around the mission in metres (default: %(default)g)",
     )
-    parser.add_argument(
-        "--mb", type=shared.parse_positive, metavar="MB", help="maximum file size in MB (default: no limit)"
-    )
+    parser.add_argument("--mb", type=shared.parse_positive, metavar="MB", help="maximum size in MB (default: no limit)")
     shared.add_json(parser)
 
 

@@ -13,9 +13,7 @@ def add(commands: Any) -> None:
     parser = add_command(commands, "profile", run_profile, "estimate memory, rate and battery use before take-off")
     subject = parser.add_mutually_exclusive_group(required=True)
     subject.add_argument("--list", action="store_true", help="list the boards")
-    subject.add_argument(
-        "--map", metavar="MAP", help="map of the flight: estimate the costs of the technique it was built with"
-    )
+    subject.add_argument("--map", metavar="MAP", help="map of the flight: estimate the costs of its technique")
     subject.add_argument("--places", type=parse_count, metavar="N", help="number of places: estimate every technique")
     parser.add_argument("--board", default="this", metavar="NAME", help="board; see --list (default: this computer)")
     parser.add_argument(

@@ -220,7 +220,7 @@ def parse_count(text: str) -> int:
 
 
 def check_output(target: str, source: str) -> Path:
-    """Return the path of the output file `target`. Raises UsageError if it is the `source`, or without a folder."""
+    """Return the path of the output file `target`. Raises UsageError if it is the `source`, or has no folder."""
     from edgevpr.core.files import require_folder
 
     path = Path(target)

@@ -181,7 +181,8 @@ class Technique(Protocol):
         """Encode an image, uint8 (H, W[, 3]). `mask`: bool (H, W), False for pixels to ignore (None: use all)."""
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape). `mean`: of those of the map."""
+        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape). `mean`: that of all coarse
+        parts of the map, of `coarse.shape`."""
 
     def score_places(
         self,

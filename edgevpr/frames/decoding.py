@@ -153,7 +153,8 @@ class VideoDecoder:
         )
 
     def fetch(self) -> TimedPacket | None:
-        """Wait for the next packet and return it; None at the end, or if the stream is lost."""
+        """Wait for the next packet and return it; None at the end, or if the stream is lost. One thread may fetch
+        while another decodes."""
         index = self.stream.index
         with av.logging.Capture() as log_lines:
             try:

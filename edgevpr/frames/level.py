@@ -40,7 +40,8 @@ _MAX_SIDE_PX = 1024  # longest side of a warped image: no technique uses more pi
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Fixed angles of the camera from straight down, forward and to the right, relative to airframe or gimbal."""
+    """Fixed angles of the camera from straight down, forward and to the right, relative to the airframe or gimbal
+    (negative: backward, to the left)."""
 
     ahead_deg: float = 0.0
     right_deg: float = 0.0

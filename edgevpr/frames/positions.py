@@ -186,7 +186,8 @@ def make_position(lat_deg: float, lon_deg: float, alt_m: float | None) -> Positi
 
 
 def _parse_number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in `column` of a row; None if the cell is empty or missing. Raises UsageError."""
+    """Return the number in `column` of a row; None if the cell is empty or missing. Raises UsageError for text that is
+    not a number from `low` to `high`."""
     if not (text := row.get(column)):
         return None
     try:

@@ -70,7 +70,7 @@ def _measure_heading(
 
 
 def _project_to_ground(points: Doubles, frame: Frame, lens: Lens) -> Array:
-    """Project image points (n, 2) to the ground. Returns complex (n,), right + i back of the nadir, in heights."""
+    """Project image points (n, 2) to the ground: complex (n,), right + i back of the nadir, in camera heights."""
     focal = 0.5 / math.tan(math.radians(lens.fov_deg) / 2)
     rays = compute_level_rotation(frame, lens) @ np.column_stack([points / focal, np.ones(len(points))]).T
     return np.asarray((rays[0] + 1j * rays[1]) / np.maximum(rays[2], 0.1))

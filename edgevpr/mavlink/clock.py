@@ -138,17 +138,18 @@ class AutopilotClock:
     def delay_s(self, boot_ms: int, now_s: float) -> float:
         """Return the transport delay in seconds of a report stamped `boot_ms`; 0.0 if the autopilot's clock is unknown.
         The delay is at least half the last round trip: if the report is not late, our messages are."""
-        boot_s = self.boot_time_s(now_s)
-        if boot_s is None:
-            return 0.0
-        return max(math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
+        age_s = self._compute_age_s(boot_ms, now_s)
+        return 0.0 if age_s is None else max(age_s, self._answers[-1].round_trip_s / 2)
 
     def has_stood_still(self, boot_ms: int, now_s: float) -> bool:
         """Return True if our monotonic clock stood still, as in a suspended computer: `boot_ms` is in our future."""
+        age_s = self._compute_age_s(boot_ms, now_s)
+        return age_s is not None and age_s < -_MAX_AHEAD_S and now_s - self._answers[-1].t_s <= _MAX_ANSWER_AGE_S
+
+    def _compute_age_s(self, boot_ms: int, now_s: float) -> float | None:
+        """Return the age of a report stamped `boot_ms`; negative if it is in our future, None if it is unknown."""
         boot_s = self.boot_time_s(now_s)
-        if boot_s is None or now_s - self._answers[-1].t_s > _MAX_ANSWER_AGE_S:
-            return False
-        return math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3) < -_MAX_AHEAD_S
+        return None if boot_s is None else math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3)
 
     def _handle_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
         """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""

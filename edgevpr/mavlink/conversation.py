@@ -74,7 +74,7 @@ class Conversation:
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
         self._was_alive: bool | None = None  # last announced state; None: no heartbeat yet
-        self._first_due_s = clock() + HEALTH_TIMEOUT_S  # when to report that no heartbeat has arrived
+        self._silence_due_s = clock() + HEALTH_TIMEOUT_S  # when to report that no heartbeat has arrived
         self._is_gps_silent = self._is_ignored = False  # last announced states
         self._own_report_s = -math.inf  # time of the autopilot's last report of the receiver that we simulate
         self._reported_inputs = 0  # number of GPS_INPUT messages sent until then
@@ -182,8 +182,8 @@ class Conversation:
         elif self._was_alive and not is_alive:
             log.warning("no heartbeat from the autopilot")
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
-        elif self._was_alive is None and not is_alive and now_s > self._first_due_s:
-            self._first_due_s = math.inf
+        elif self._was_alive is None and not is_alive and now_s > self._silence_due_s:
+            self._silence_due_s = math.inf
             log.warning("no heartbeat from an autopilot yet: `edgevpr doctor` shows why")
         if is_alive or self._was_alive is not None:
             self._was_alive = is_alive

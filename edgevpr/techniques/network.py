@@ -176,9 +176,7 @@ def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Sin
     vector (Hinrichs and Vybíral 2011), so the product is a correlation, computed by the Fourier transform. For 43,008
     activations and 1064 dimensions a full matrix would take 183 MB."""
     if length > size:
-        raise ModelError(
-            f"A feature map of {size} values cannot be projected to {length} dimensions: use at most {size}."
-        )
+        raise ModelError(f"A feature map of {size} values cannot have {length} dimensions: use at most {size}.")
     row, signs = make_gaussian_row(size, seed)
     spectrum = np.conj(np.fft.rfft(row))  # row j of the matrix is the Gaussian vector shifted by j: a correlation
 

@@ -65,7 +65,8 @@ def _estimate_offset_s(image_times_s: Doubles, trigger_times_s: Doubles, toleran
     sample_s = image_times_s[:: max(1, len(image_times_s) // _MAX_COMPARED)]
     differences_s = (trigger_times_s - sample_s[:, None]).ravel()
     bins, counts = np.unique(np.round(differences_s / tolerance_s).astype(np.int64), return_counts=True)
-    in_zones = bins[np.abs(np.remainder(bins * tolerance_s + ZONE_STEP_S / 2, ZONE_STEP_S) - ZONE_STEP_S / 2) < 2.0]
+    off_zone_s = bins * tolerance_s - ZONE_STEP_S * np.round(bins * tolerance_s / ZONE_STEP_S)
+    in_zones = bins[np.abs(off_zone_s) <= _MAX_CLOCK_ERROR_S + tolerance_s / 2]
     fits = []
     for bin_number in {*bins[np.argsort(-counts, kind="stable")[:_MAX_OFFSETS]].tolist(), *in_zones.tolist()}:
         near_s = differences_s[np.abs(differences_s - bin_number * tolerance_s) <= tolerance_s]
@@ -73,11 +74,11 @@ def _estimate_offset_s(image_times_s: Doubles, trigger_times_s: Doubles, toleran
         distances_s = np.abs(trigger_times_s - (sample_s + offset_s)[:, None]).min(axis=1)
         is_matched = distances_s <= tolerance_s
         fits.append((int(is_matched.sum()), -float(distances_s[is_matched].sum()), offset_s))
-    count, distance_s, best_s = max(fits)
+    best = count, distance_s, best_s = max(fits)
     rivals = [fit for fit in fits if fit[0] >= _MIN_RIVAL * count and abs(fit[2] - best_s) > 2 * tolerance_s]
     if not any(rival_distance_s >= _MIN_LEAD * distance_s for _, rival_distance_s, _ in rivals):
         return best_s
-    zoned = [fit for fit in (max(fits), *rivals) if abs(math.remainder(fit[2], ZONE_STEP_S)) <= _MAX_CLOCK_ERROR_S]
+    zoned = [fit for fit in (best, *rivals) if abs(math.remainder(fit[2], ZONE_STEP_S)) <= _MAX_CLOCK_ERROR_S]
     return max(zoned)[2] if zoned and np.ptp([fit[2] for fit in zoned]) <= 2 * tolerance_s else None
 
 

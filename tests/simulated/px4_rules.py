@@ -180,8 +180,7 @@ class Px4(Firmware):
 
     def take_odometry(self, message: Message) -> None:
         """Fuse the position of an ODOMETRY in the local frame, as external vision (Ekf::controlEvPosFusion). Its time
-        stamp is ignored. While GPS is fused it only shows how the vehicle moves: what it is off by is a bias, which
-        stays when GPS is lost."""
+        stamp is ignored. While GPS is fused it only shows motion: what it is off by is a bias, which stays."""
         parameters, ours, variance_m2 = self.parameters, self._ours, message.pose_covariance[0]
         if not int(parameters["EKF2_EV_CTRL"]) & 1 or message.frame_id != mavlink.MAV_FRAME_LOCAL_NED:
             return

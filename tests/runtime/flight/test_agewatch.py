@@ -57,7 +57,8 @@ class LateCameraFlight(SimFlight):
         heading_deg = self.heading_deg(true_step * STEP_S) + self.rng.normal(0, 1.0)
         event = replace(event, frame=frame, picture=picture, located=replace(event.located, heading_deg=heading_deg))
         self.off_s, self.t_sd_s = frame.t_mono_s - true_step * STEP_S, frame.t_sd_s
-        _ = self.navigator.is_out_of_reach(event) or age.judge(event)
+        if not self.navigator.is_out_of_reach(event):
+            age.judge(event)
         if age.is_unknown:
             self.refused.append(self.t_s)
             return Advice(None, Reason(ReasonCode.AGE_UNKNOWN))
