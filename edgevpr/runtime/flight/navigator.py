@@ -27,7 +27,7 @@ from edgevpr.runtime.flight.measurements import (
     position_match,
 )
 from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
-from edgevpr.runtime.flight.output import Output, OutputWatch
+from edgevpr.runtime.flight.output import MATCH_PROOF_S, Output, OutputWatch
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -59,6 +59,11 @@ CORRELATION_FACTOR = math.sqrt(50)
 _PX4_CORRELATION_FACTOR = 1.5
 _ATTITUDE_ERROR_VALID_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
+# PX4 refuses positions that are farther from its own than three (EKF2_AGP0_GATE) of the claimed and its own standard
+# deviations together, and flies on without them for 7 s: after a gap of 3 s, in which it had drifted by 20 m, a copter
+# strayed 53 m. So a position that matches prove claims, up to this distance, at least so much that PX4 uses it.
+_PX4_GATE_SIGMA = 2.5
+_MAX_PX4_DISTANCE_M = 40.0
 # Between these two times after a lost receiver has become steady, "no fix" is sent as GPS_INPUT, so
 # that ArduPilot returns to its receiver at once (AP_GPS::update_primary).
 _GPS_BACK_FROM_S = 1.0
@@ -264,6 +269,10 @@ class Navigator(Listener):
         lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
         east, north = estimate.velocity_m_s
         attitude, factor = self._attitude, self._correlation_factor(vehicle, t_s)
+        accuracy_m = factor * math.hypot(self._compute_claimed_m(estimate), lag_m)
+        if self._channel is Channel.SENSOR and t_s - self._navigation.last_fix_s <= MATCH_PROOF_S:
+            away_m = float(distance_m(lat_deg, lon_deg, vehicle.lat_deg, vehicle.lon_deg))
+            accuracy_m = max(accuracy_m, away_m / _PX4_GATE_SIGMA if away_m <= _MAX_PX4_DISTANCE_M else 0.0)
         is_fallback, receiver = self.output is Output.RESERVE, vehicle.gps
         return MotionState(
             t_mono_s=t_s,
@@ -272,7 +281,7 @@ class Navigator(Listener):
             # The autopilot's own altitude may come from us, so with a receiver its altitude is sent.
             alt_m=receiver.alt_m if is_fallback and receiver and receiver.alt_m is not None else vehicle.alt_m,
             velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-            accuracy_m=factor * math.hypot(self._compute_claimed_m(estimate), lag_m),
+            accuracy_m=accuracy_m,
             alt_accuracy_m=_ALT_SD_M,
             speed_accuracy_m_s=factor * estimate.speed_accuracy_m_s,
             attitude=None if attitude is None else _to_radians(attitude),
