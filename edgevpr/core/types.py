@@ -73,7 +73,8 @@ class Vehicle:
     wrong: an autopilot keeps reporting its estimate long after it has lost GPS.
     `roll_deg`, `pitch_deg`: positive for right wing down and for nose up; `tilt_rate_deg_s`: rate of both together.
     `height_m`: above ground; `height_doubt_m`: by how much its sources disagree; `height_step_m`: sum of its steps at
-    changes of its source. `velocity_m_s`: over ground (east, north). `sink_m_s`: velocity down. `innovation_ratio`:
+    changes of its source; `heading_step_deg`: sum of the steps of the heading that its rate does not explain.
+    `velocity_m_s`: over ground (east, north). `sink_m_s`: velocity down. `innovation_ratio`:
     innovation of measured positions over the filter's gate; above 1 the filter refuses them. `has_position`: the filter
     has a position. `gps`: newest receiver position, near the estimate or not (None: none is recent). `gps_is_silent`:
     reports of a receiver with a fix have stopped, so it is unknown whether it still has one. `reaches_another`: another
@@ -92,6 +93,7 @@ class Vehicle:
     height_m: float | None = None
     height_doubt_m: float = 0.0
     height_step_m: float = 0.0
+    heading_step_deg: float = 0.0
     velocity_m_s: tuple[float, float] | None = None
     sink_m_s: float | None = None
     has_position: bool = True

@@ -356,6 +356,7 @@ class Autopilot:
             height_m=self.heights.compute_height_m(now_s),
             height_doubt_m=self.heights.doubt_m,
             height_step_m=self.heights.stepped_m,
+            heading_step_deg=self.attitudes.heading_step_deg,
             has_position=self.accuracy.has_position,
             position_sd_m=self.accuracy.compute_sd_m(now_s),
             innovation_ratio=self.accuracy.innovation_ratio(now_s),

@@ -15,6 +15,10 @@ HISTORY_S = 6.0  # of reports: a frame is not used after 5 s
 _MAX_ATTITUDES = 300
 _RATE_S = 3.0  # over which the rate of attitudes is measured
 _MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and the frame that uses it
+# A heading that changes by more than its rate explains is not the aircraft's turn: the compass was disturbed, or the
+# autopilot has corrected its estimate.
+_MIN_HEADING_STEP_DEG = 5.0
+_MAX_STEP_INTERVAL_S = 0.5
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
 # four times as fast, which is four standard deviations.
 DRIFT_M_S = 5.0
@@ -39,10 +43,12 @@ class Attitude(NamedTuple):
 
 
 class Attitudes:
-    """The attitudes of the last six seconds."""
+    """The attitudes of the last six seconds. `heading_step_deg`: sum of the steps of the heading that its rate does not
+    explain."""
 
     def __init__(self) -> None:
         self._history: tuple[Attitude, ...] = ()
+        self._yaw_rate_deg_s, self.heading_step_deg = 0.0, 0.0
 
     def rate_hz(self, now_s: float) -> float:
         """Return the rate of attitudes received in the last three seconds."""
@@ -54,7 +60,18 @@ class Attitudes:
         if all(map(math.isfinite, radians)):
             recent = self._history[1 - _MAX_ATTITUDES :]
             first = bisect_left(recent, now_s - HISTORY_S, key=_get_time_s)
+            self._add_heading_step(message, now_s)
             self._history = (*recent[first:], Attitude(now_s, *map(math.degrees, radians)))
+
+    def _add_heading_step(self, message: Message, now_s: float) -> None:
+        turned_rad_s = message.pitchspeed * math.sin(message.roll) + message.yawspeed * math.cos(message.roll)
+        old_deg_s, rate_deg_s = self._yaw_rate_deg_s, math.degrees(turned_rad_s / math.cos(message.pitch))
+        self._yaw_rate_deg_s = rate_deg_s
+        if self._history and (step_s := now_s - self._history[-1].t_s) <= _MAX_STEP_INTERVAL_S:
+            turned_deg = step_s * (rate_deg_s + old_deg_s) / 2
+            step_deg = abs(wrap_deg(math.degrees(message.yaw) - self._history[-1].yaw_deg - turned_deg))
+            if step_deg > _MIN_HEADING_STEP_DEG + step_s * abs(rate_deg_s - old_deg_s):
+                self.heading_step_deg += step_deg
 
     def interpolate(self, t_s: float) -> Attitude | None:
         """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s, or of the only one."""

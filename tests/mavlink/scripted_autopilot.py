@@ -111,9 +111,9 @@ class Autopilot:
         second = () if message is mavlink.MAVLink_gps_raw_int_message else (0, 0)
         self.send(message(0, fix_type, round(lat_deg * 1e7), 80_000_000, 0, 80, 120, 0, 0, 14, *second, h_acc=h_acc))
 
-    def attitude(self, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
-        radians = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
-        self.send(mavlink.MAVLink_attitude_message(self.boot_ms, *radians, 0, 0, 0))
+    def attitude(self, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0, pitch_deg_s=0.0, yaw_deg_s=0.0):
+        radians = map(math.radians, (roll_deg, pitch_deg, yaw_deg, 0.0, pitch_deg_s, yaw_deg_s))
+        self.send(mavlink.MAVLink_attitude_message(self.boot_ms, *radians))
 
     def fly_on(self, seconds, attitude_hz, filter_flags=831):
         for _ in range(seconds * attitude_hz):

@@ -166,6 +166,16 @@ def test_attitude_is_that_of_the_frame_time(autopilot):
     assert autopilot.vehicle.roll_deg is None
 
 
+@pytest.mark.parametrize(
+    ("roll_deg", "pitch_deg_s", "yaw_deg_s", "step_deg"), [(0, 0, 0, 20), (0, 0, 100, 0), (60, 86.6, 50, 0)]
+)
+def test_heading_steps_where_the_gyros_do_not_turn(autopilot, roll_deg, pitch_deg_s, yaw_deg_s, step_deg):
+    for yaw_deg in (350, 10):
+        autopilot.attitude(roll_deg, 0, yaw_deg, pitch_deg_s, yaw_deg_s)
+        autopilot.wait(0.2)
+    assert autopilot.position().heading_step_deg == pytest.approx(step_deg, abs=0.1)
+
+
 def test_height_uses_the_best_source(autopilot):
     assert autopilot.position().height_m == 80.0, "over the take-off point"
     autopilot.terrain(65.0)

@@ -36,6 +36,10 @@ class Estimator:
     def error_m(self) -> complex:
         return complex(self._state[0])
 
+    @error_m.setter
+    def error_m(self, value: complex) -> None:
+        self._state[0] = value
+
     @property
     def velocity_error_m_s(self) -> complex:
         return complex(self._state[1])

@@ -56,6 +56,7 @@ class Firmware(ABC):
         self.test_ratio = 0.0
         self.start_utc_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
+        self.turn_rad_s = 0.0  # of the true heading, clockwise
         self._wind_m_s = 0j  # as the filter has learnt it
 
     def step(self, dt_s: float) -> None:
@@ -63,7 +64,8 @@ class Firmware(ABC):
         self.now_s += dt_s
         turn = cmath.rect(1.0, math.radians(self.heading_error_deg))
         self.motion.steer(self.estimator.error_m, self.estimator.velocity_error_m_s, self.tilt, turn)
-        self.truth = self.motion.step(self.now_s, dt_s)
+        old_heading_deg, self.truth = self.truth.heading_deg, self.motion.step(self.now_s, dt_s)
+        self.turn_rad_s = math.radians(math.remainder(self.truth.heading_deg - old_heading_deg, 360)) / dt_s
         self.estimator.velocity_error_m_s += (turn.conjugate() - 1) * self.truth.acceleration_m_s2 * dt_s
         self.receivers.step(self.truth, self.now_s)
         self._estimate(1j * self.parameters["SIM_WIND_SPD"], dt_s)

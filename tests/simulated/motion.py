@@ -85,6 +85,10 @@ class Hover(Motion):
     def away_m(self) -> float:
         return abs(self._offset_m - self._target_m)
 
+    def cruise(self, velocity_m_s: complex) -> None:
+        """Move the target by another velocity from now on; the heading stays."""
+        self._cruise_m_s = velocity_m_s
+
     def steer(self, error_m: complex, velocity_error_m_s: complex, tilt: complex, turn: complex) -> None:
         to_target_m = self._target_m - (self._offset_m + error_m)
         wanted_m_s = self._cruise_m_s + _limit(_SPEED_GAIN_HZ * to_target_m, _MAX_CORRECTION_M_S)

@@ -57,7 +57,9 @@ def _attitude(brain: Firmware) -> Message | None:
     if math.isnan(roll_deg + pitch_deg):  # the track does not say
         return None
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
-    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, _compute_yaw(brain), 0, 0, 0)
+    turn_rad_s = 0.0 if math.isnan(brain.turn_rad_s) else brain.turn_rad_s * math.cos(pitch)
+    rates_rad_s = 0.0, turn_rad_s * math.sin(roll), turn_rad_s * math.cos(roll)  # as gyros measure them
+    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, _compute_yaw(brain), *rates_rad_s)
 
 
 def _specific_force(brain: Firmware) -> Message:

@@ -28,6 +28,7 @@ _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 # After so many such steps in a row, none is used until a fix or GPS: a less certain state would agree after 15 s.
 _MAX_CONTRADICTIONS = 3
+_MIN_STEP_SIGMA = 3.0
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # random change of that error in one second
 # Its heading then drifts too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
@@ -108,6 +109,7 @@ class DriftFilter:
         self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
         self._contradictions = 0  # steps of odometry in a row that contradicted the state, since the last fix or GPS
         self._is_rotated = False  # the image of the last fix, by more than odometry is corrected for
+        self._heading_step_rad = 0.0  # sum of the unexplained steps of the heading
         # Mean square of the attitude errors in the last pictures, divided by their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
         self._attitude_error_sd = _TYPICAL_ATTITUDE_ERROR_SD  # mean of the standard deviations of these errors
@@ -170,12 +172,20 @@ class DriftFilter:
         self._correct(matrix[: errors.size], errors, np.diag(variances[: errors.size]))
 
     def add_frame(
-        self, age_s: float, attitude_gain_s2: float, sd_m: float, step: OdometryStep | None, path_moved_m: Doubles
+        self,
+        age_s: float,
+        bend_m: Doubles,
+        attitude_gain_s2: float,
+        sd_m: float,
+        step: OdometryStep | None,
+        path_moved_m: Doubles,
     ) -> bool:
-        """Process a frame taken `age_s` ago, and correct the state by the `step` of odometry since the previous frame
-        (None: unknown), in which the path moved by `path_moved_m` (2,). `sd_m`: of the frame's position on each axis,
-        without the effect of the attitude error. Returns True if the step agrees with the state and is used."""
+        """Process a frame taken `age_s` ago, when the path was `bend_m` (2,) off the line that it follows now; correct
+        the state by the `step` of odometry since the previous frame (None: unknown), in which the path moved by
+        `path_moved_m` (2,). `sd_m`: of the frame's position on each axis, without the effect of the attitude error.
+        Returns True if the step agrees with the state and is used."""
         self._frame = position, variance_m2 = self._make_position_jacobian(age_s, attitude_gain_s2), sd_m**2
+        position[:, _HEADING] = self._drift.is_inertial * np.array([bend_m[1], -bend_m[0]])
         if step is None or self._is_rotated or self._contradictions == _MAX_CONTRADICTIONS:
             self._begin_frame()
             return False
@@ -185,7 +195,10 @@ class DriftFilter:
         self._p[:, _SCALE] *= ratio
         self._p[_SCALE, _SCALE] += (ratio * step.log_height_sd) ** 2
         (east_m, north_m), matrix, transition = step.moved_m, position - _FRAME, _IDENTITY.copy()
-        transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
+        # A step within its noise shows neither direction nor scale: in a hover, noise would seem to confirm them.
+        noise_m2 = _MIN_STEP_SIGMA**2 * (step.sd_m**2 + 2 * variance_m2)
+        part = max(0.0, 1.0 - noise_m2 / max(noise_m2, east_m**2 + north_m**2))
+        transition[_F, _K] = part * np.array([[east_m, north_m], [north_m, -east_m]])
         transition[_F, _HEADING] = transition[_F, _TURN]
         x, p = transition @ self._x, transition @ self._p @ transition.T
         x[_F] += np.array(step.moved_m) - path_moved_m
@@ -202,7 +215,7 @@ class DriftFilter:
         """Correct the direction of odometry and the heading by a match whose picture is rotated by `rotation` (radians,
         clockwise) against the compass. After a large rotation, odometry is not used until a match shows a smaller one.
         The motion shows later whether the camera or the compass is rotated."""
-        self._is_rotated = abs(rotation) > _MAX_ROTATION_RAD
+        self._is_rotated = abs(rotation) > _MAX_ROTATION_RAD + self._heading_step_rad
         if self._is_rotated:
             return
         matrix = np.zeros((1, _SIZE))
@@ -211,6 +224,13 @@ class DriftFilter:
         if mahalanobis(error - matrix @ self._x, matrix @ self._p @ matrix.T + variance) > _MAX_ROTATION_SIGMA:
             self._p[_HEADING, _HEADING] += self._drift.heading_sd**2
         self._correct(matrix, error, variance)
+
+    def doubt_heading(self, step_rad: float) -> None:
+        """Process a step of the reported heading that the gyros did not measure: before it or since then, heading and
+        direction of odometry have been wrong by as much."""
+        part = _HEADING if self._drift.is_inertial else _TURN
+        self._p[part, part] += step_rad**2
+        self._heading_step_rad += step_rad
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""

@@ -69,6 +69,7 @@ class Navigation:
         self._unconfirmed: list[PositionedMatch] = []  # agree with each other; nothing else supports them
         self.last_gps_s = self.last_fix_s = self._last_odometry_s = self._last_query_s = -math.inf
         self._query_interval_s = math.inf
+        self._heading_step_s = -math.inf  # when the reported heading last changed without a turn
         self._doubt_m = np.zeros(2)  # error of odometry since the last fix or GPS position, because heights contradict
         self._contradicted_since_s: float | None = None
 
@@ -189,6 +190,11 @@ class Navigation:
     def _record_gps(self, now_s: float) -> None:
         self.last_gps_s, self.is_confirmed, self._doubt_m = now_s, True, np.zeros(2)
 
+    def doubt_heading(self, step_rad: float, t_s: float) -> None:
+        """Process a step of the reported heading at `t_s` that the gyros did not measure."""
+        self._filter.doubt_heading(step_rad)
+        self._heading_step_s = t_s
+
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         self._filter.restart_odometry_scale(error, tolerance)
 
@@ -216,7 +222,8 @@ class Navigation:
             step, path_moved_m = frame.odometry, point.position_m - before.position_m
             self._doubt_m = self._doubt_m + frame.scale_sd * np.array(step.moved_m)
         age_s = path.now.t_s - frame.t_s
-        if self._filter.add_frame(age_s, frame.attitude_gain_s2, frame.sd_m, step, path_moved_m) and step:
+        bend_m = point.position_m - (path.now.position_m - age_s * path.now.velocity_m_s)
+        if self._filter.add_frame(age_s, bend_m, frame.attitude_gain_s2, frame.sd_m, step, path_moved_m) and step:
             self._last_odometry_s = frame.t_s
 
     def predict_fix(self, match: PositionedMatch) -> PredictedFix | None:
@@ -245,7 +252,7 @@ class Navigation:
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
                 self._filter.correct_by_attitude_error(np.array(error.nadir_shift), error.sd)
-            if match.heading_error_deg is not None:
+            if match.heading_error_deg is not None and match.t_s > self._heading_step_s:
                 self._filter.correct_by_rotation(math.radians(match.heading_error_deg))
             self.last_fix_s, self._doubt_m = max(self.last_fix_s, match.t_s), np.zeros(2)
 

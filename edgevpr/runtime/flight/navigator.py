@@ -158,8 +158,11 @@ class Navigator(Listener):
 
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of position and velocity."""
-        self._vehicle = vehicle
         navigation = self._navigation
+        if self._vehicle and vehicle.heading_step_deg > self._vehicle.heading_step_deg:
+            step_deg = vehicle.heading_step_deg - self._vehicle.heading_step_deg
+            navigation.doubt_heading(math.radians(step_deg), vehicle.t_received_s)
+        self._vehicle = vehicle
         navigation.add_report(vehicle, self._trusts_gps)
         self._watch.update(vehicle, navigation.last_fix_s, navigation.has_gps)
         if navigation.path_velocity_m_s is not None:

@@ -182,14 +182,14 @@ def test_odometry_is_scaled_and_claims_the_error_of_terrain(log_height, sd, leas
     """A hundred metres of strides without a match: over flat ground, after a gap, and over ground that fell away."""
     errors = DriftFilter(INERTIAL, 1.0)
     errors.start(1.0, 100.0)
-    errors.add_frame(0.0, 0.0, 0.2, None, np.zeros(2))
+    errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, None, np.zeros(2))
     for number in range(10):
         errors.predict(1.0, np.zeros(2))
         change, change_sd = (0.0, 0.0) if number else (log_height, sd)
         step = OdometryStep(
             from_s=0.0, to_s=1.0, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, log_height=change, log_height_sd=change_sd
         )
-        assert errors.add_frame(0.0, 0.0, 0.2, step, np.zeros(2))
+        assert errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, step, np.zeros(2))
     offset_m, _, covariance = errors.estimate_errors(0.0)
     assert offset_m == pytest.approx((100 * math.exp(log_height), 0.0), abs=1.0)
     assert least_m <= math.sqrt(covariance[0, 0]) <= most_m

@@ -253,6 +253,25 @@ def test_odometry_of_a_compass_that_has_jumped_stays_unused_until_a_match():
     assert flight.navigator.output is Output.UNKNOWN
 
 
+@pytest.mark.parametrize("turned_deg", [-60, 30])
+def test_positions_end_when_a_compass_has_jumped_in_a_hover(turned_deg):
+    """Nothing shows there whether the heading before or after the step is wrong; the way flown on by it is claimed."""
+    flight = ClosedLoop("arducopter", **GPS_INPUT).fly(SETTLED_S)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(15)
+    flight.matches, flight.heading_error_deg = False, turned_deg
+    flight.fly(10).motion.cruise(8j)
+    assert not flight.fly(25).positions_sent(flight.now_s - 8)
+
+
+def test_px4_is_given_proven_positions_that_it_does_not_refuse():
+    """Refused for seven seconds, they let it fly on from where it has drifted meanwhile."""
+    flight = ClosedLoop("px4-copter", **SENSOR)
+    flight.show_tilt = True
+    flight.fly(SETTLED_S).set("SIM_GPS1_ENABLE", 0).fly(20)
+    flight.brain.estimator.error_m += 25.0
+    assert flight.fly(5).error_m[-1] < 10
+
+
 @pytest.mark.parametrize(("every_s", "fixes"), [(20, 40), (60, 6)])
 def test_a_plane_gets_fixes_of_rare_matches_without_odometry(every_s, fixes):
     """Each is predicted to no better than 36 and 180 m in wind; single fixes follow a match for up to a minute."""
