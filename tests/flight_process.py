@@ -33,12 +33,8 @@ def start(
 ) -> subprocess.Popen:
     """Start a flight, by way of the program `through` where one is named (`prlimit ...`)."""
     command = ["-m", "edgevpr", "run", "--map", place_map, "--source", source, "--log", log, *flags]
-    return subprocess.Popen(
-        [*through, sys.executable, *map(str, command)],
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **environment},
-    )
+    env = {**os.environ, **environment}
+    return subprocess.Popen([*through, sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True, env=env)
 
 
 @contextmanager

@@ -53,13 +53,9 @@ class HangingCapture(Capture):
         hang()
 
 
-def _hang_in_main(self, *_):
-    hang()
-
-
 if __name__ == "__main__":
     source._make_capture = lambda *_: HangingCapture
     if _STEP == "main":
-        Flight._publish = _hang_in_main
+        Flight._publish = lambda *_: hang()
     del sys.argv[1:3]
     program()

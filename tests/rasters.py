@@ -53,15 +53,11 @@ def grid(crs: str, pixel_m: float, side_px: int, rotation_deg: float = 0.0):
     half = side_px / 2
     to_crs = Affine(across, along, x - half * (across + along), along, -across, y - half * (along - across))
     columns, rows = np.meshgrid(np.arange(side_px) + 0.5, np.arange(side_px) + 0.5)
-    x, y = to_crs_point(to_crs, columns.ravel(), rows.ravel())
-    lon_deg, lat_deg = transform(crs, "EPSG:4326", x, y)
+    x = to_crs.a * columns + to_crs.b * rows + to_crs.c
+    y = to_crs.d * columns + to_crs.e * rows + to_crs.f
+    lon_deg, lat_deg = transform(crs, "EPSG:4326", x.ravel(), y.ravel())
     east_m, north_m = ground_m(lat_deg, lon_deg)
     return to_crs, east_m.reshape(columns.shape), north_m.reshape(columns.shape)
-
-
-def to_crs_point(to_crs, column, row):
-    """The coordinates of points of a picture."""
-    return to_crs.a * column + to_crs.b * row + to_crs.c, to_crs.d * column + to_crs.e * row + to_crs.f
 
 
 def write_raster(path: Path, bands: np.ndarray, crs: str | None, to_crs, **profile) -> Path:

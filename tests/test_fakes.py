@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import cv2
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, make_vehicle
-from loopback import wait_until
+from loopback import free_port, wait_until
 from mavlink_peers import AutopilotThread, Peer, UdpPort, make_link
 from pictures import draw_texture
 from simulated.motion import TrueState
@@ -32,8 +32,7 @@ def recording(request, tmp_path):
         return FakeSource(pictures, FakeClock(), is_live=False)
     for number in range(COUNT):
         cv2.imwrite(str(tmp_path / f"{number}.png"), draw_texture(number))
-    whole = (tmp_path / "1.png").read_bytes()
-    (tmp_path / "1.png").write_bytes(whole[:200])
+    (tmp_path / "1.png").write_bytes((tmp_path / "1.png").read_bytes()[:200])
     return open_source(str(tmp_path), live=True)
 
 
@@ -89,11 +88,8 @@ def link(request):
     if request.param == "fake":
         yield FakeLink(clock, vehicle=lambda: make_vehicle(50.0, 8.0, clock.now_s, has_gps=False)), clock
         return
-    port = UdpPort()
-    number = port.number
-    port.close()
-    track = [TrueState(lat_deg=50.0, lon_deg=8.0, alt_m=300.0)]
-    autopilot = AutopilotThread(f"udpin:127.0.0.1:{number}", track=track)
+    number = free_port()
+    autopilot = AutopilotThread(f"udpin:127.0.0.1:{number}", track=[TrueState(lat_deg=50.0, lon_deg=8.0, alt_m=300.0)])
     ahead_s = clock.now_s - time.monotonic()
 
     def is_ready():

@@ -170,9 +170,8 @@ def _draw_bright(rng, height, width):
 def _draw_white_noise(rng, height, width):
     middle, sigma = rng.uniform(40, 200), rng.uniform(5, 90)
     channels = 1 if rng.random() < 0.6 else 3
-    return np.clip(fill(height, width, 0) + rng.normal(middle, sigma, (height, width, channels)), 0, 255).astype(
-        np.uint8
-    )
+    noise = rng.normal(middle, sigma, (height, width, channels))
+    return np.clip(fill(height, width, 0) + noise, 0, 255).astype(np.uint8)
 
 
 def _draw_banded_noise(rng, height, width):

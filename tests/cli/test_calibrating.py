@@ -27,16 +27,14 @@ def few_suffice(monkeypatch):
 def flight(tmp_path_factory):
     """Pictures with positions, and those of another flight of the same names."""
     folder = tmp_path_factory.mktemp("flight")
-    pictures = [draw_texture(number, 240, 320) for number in range(PLACES)]
-    write_flight(folder / "ref", pictures, step_deg=0.002)
+    write_flight(folder / "ref", [draw_texture(number, 240, 320) for number in range(PLACES)], step_deg=0.002)
     write_flight(folder / "other", [draw_texture(50 + number, 240, 320) for number in range(PLACES)])
     return folder
 
 
 def build_map(path, images, *flags):
-    return main(
-        ["map", "build", str(path), "--images", str(images), "--technique", "cohog", "--param", "w1=208", *flags]
-    )
+    words = ["map", "build", str(path), "--images", str(images), "--technique", "cohog", "--param", "w1=208", *flags]
+    return main(words)
 
 
 @pytest.fixture(scope="module")

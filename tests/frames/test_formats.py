@@ -159,8 +159,7 @@ def test_depth_range_shows_an_image_outside_the_range_with_its_own_range():
     first, *_ = (depth.to_8_bits(counts) for counts in flight)
     moved = depth.to_8_bits(flight[0] + np.uint16(3000))  # as after the calibration of a thermal camera's shutter
     assert np.abs(first.astype(int) - moved).mean() < 12
-    narrow = depth.to_8_bits(to_counts(SCENE, 0.5))
-    assert narrow.std() > 0.8 * first.std()
+    assert depth.to_8_bits(to_counts(SCENE, 0.5)).std() > 0.8 * first.std()
 
 
 def test_depth_range_does_not_amplify_noise_without_a_scene():

@@ -110,8 +110,7 @@ def test_stamped_time_is_unknown_if_congestion_and_clock_drift_look_alike():
 
 def test_stamped_time_follows_a_camera_whose_clock_rate_becomes_correct():
     rng = np.random.default_rng(3)
-    steps_s = np.r_[np.full(12 * 30, 1 / 12), np.full(25 * 60, 1 / 25)]
-    taken_s = np.cumsum(steps_s)
+    taken_s = np.cumsum(np.r_[np.full(12 * 30, 1 / 12), np.full(25 * 60, 1 / 25)])
     sizes = draw_sizes(len(taken_s), rng)
     time, ages_s = StampedTime(), []
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))

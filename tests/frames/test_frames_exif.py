@@ -154,8 +154,7 @@ def test_map_build_refuses_and_reports_wide_and_tele_pictures_in_one_folder(foca
 @pytest.mark.parametrize(("images_each", "is_reported"), [(1, False), (3, False), (12, True)])
 def test_map_build_asks_whether_gps_was_frozen(tmp_path, caplog, images_each, is_reported):
     for number in range(12):
-        photographs.write_jpeg(
-            tmp_path / f"{number:02d}.jpg", GPS | {LAT: (46.0, number // images_each, 0.0), ALT: number}
-        )
+        gps = GPS | {LAT: (46.0, number // images_each, 0.0), ALT: number}
+        photographs.write_jpeg(tmp_path / f"{number:02d}.jpg", gps)
     warn_of_gaps(FlightPictures(source=str(tmp_path)), 0, None)
     assert ("was GPS frozen?" in caplog.text) == is_reported

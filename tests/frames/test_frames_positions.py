@@ -147,8 +147,7 @@ def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, writ
 def test_read_positions_names_a_missing_or_duplicate_column(text, column, write_table):
     with pytest.raises(UsageError, match=f"line 1.*`{column}`"):
         read_positions(write_table(text))
-    table = write_table("file,lat,lon,note,note\na.jpg,,,,\n")
-    assert read_positions(table) == {"a.jpg": GeoTag()}
+    assert read_positions(write_table("file,lat,lon,note,note\na.jpg,,,,\n")) == {"a.jpg": GeoTag()}
 
 
 def test_read_positions_refuses_binary_files(write_table, tmp_path):

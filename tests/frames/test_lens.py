@@ -206,8 +206,7 @@ def test_undistort_frame_moves_the_mask_with_its_image(ground):
     camera = make_wide_camera()
     overlay = np.ones(SIZE_PX[::-1], bool)
     overlay[:, :160] = False
-    grey = np.where(overlay, 255, 0).astype(np.uint8)
-    found = undistort_frame(grey, overlay, UNKNOWN_VIEW, make_lens(camera))
+    found = undistort_frame(np.where(overlay, 255, 0).astype(np.uint8), overlay, UNKNOWN_VIEW, make_lens(camera))
     assert found.mask is not None
     assert 0.6 < found.mask.mean() < 0.95
     sure = (found.image < 5) | (found.image > 250)

@@ -75,8 +75,7 @@ def test_query_map_queries_each_image_in_three_ways(place_map):
     assert [each.place_id for each in answers] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert all(each.right for each in answers if each.way == THERE)
     assert not any(each.right for each in answers if each.way != THERE)
-    again = list(query_map(search, pictures))
-    assert again == answers
+    assert list(query_map(search, pictures)) == answers
 
 
 def test_calibration_is_stored_in_the_map(place_map):

@@ -78,8 +78,7 @@ def test_orthophoto_reads_a_file_across_the_antimeridian(tmp_path, crs, west):
 
 @pytest.mark.parametrize("pixel_m", [0.07, 0.45])
 def test_pixels_much_finer_or_coarser_than_the_picture_are_averaged_and_in_place(tmp_path, pixel_m):
-    path = write_marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m))
-    picture, valid = cut(path)
+    picture, valid = cut(write_marked_raster(tmp_path / "o.tif", pixel_m=pixel_m, side_px=int(84 / pixel_m)))
     assert valid.all()
     require_marks(picture, within_px=0.2)
 
@@ -151,8 +150,7 @@ def test_orthophoto_refuses_other_files_in_one_sentence(tmp_path):
     assert "is a folder" in read_refusal(tmp_path)
     (tmp_path / "notes.tif").write_text("not a raster")
     assert "opened" in read_refusal(tmp_path / "notes.tif")
-    no_crs = write_raster(tmp_path / "a.tif", byte, None, to_crs)
-    assert "georeference" in read_refusal(no_crs)
+    assert "georeference" in read_refusal(write_raster(tmp_path / "a.tif", byte, None, to_crs))
     no_place = write_raster(tmp_path / "b.tif", byte, "EPSG:32632", rasterio.Affine.identity())
     assert "georeference" in read_refusal(no_place)
     nameless = write_raster(tmp_path / "d.tif", byte, "+proj=utm +zone=32 +ellps=bessel", to_crs)
@@ -165,8 +163,7 @@ def test_orthophoto_refuses_other_files_in_one_sentence(tmp_path):
     assert "gdal_translate -ot Byte" in read_refusal(deep)
     local = write_raster(tmp_path / "d.tif", byte, 'LOCAL_CS["site",UNIT["metre",1]]', to_crs)
     assert "latitude" in read_refusal(local)
-    metres = write_raster(tmp_path / "g.tif", byte, "EPSG:4326", to_crs)
-    assert "not degrees" in read_refusal(metres)
+    assert "not degrees" in read_refusal(write_raster(tmp_path / "g.tif", byte, "EPSG:4326", to_crs))
     palette = write_raster(tmp_path / "e.tif", byte, "EPSG:32632", to_crs, photometric="palette")
     with rasterio.open(palette, "r+") as data:
         data.write_colormap(1, {number: (number, 0, 0, 255) for number in range(256)})
@@ -185,7 +182,6 @@ def test_cut_draws_no_dark_line_at_the_edge_of_the_data(tmp_path):
     to_crs, _, _ = grid("EPSG:32632", 0.13, 800)
     picture = np.full((1, 800, 800), 150, np.uint8)
     picture[..., :400] = 0
-    path = write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0)
-    cut_out, valid = cut(path)
+    cut_out, valid = cut(write_raster(tmp_path / "o.tif", picture, "EPSG:32632", to_crs, nodata=0))
     assert 0.4 < valid.mean() < 0.6
     assert cut_out.min() >= 145

@@ -29,8 +29,7 @@ def read_all_frames(source: OrthophotoSource) -> list:
 
 def open_grid(path, footprint_m, spacing_m, area=None, only=None) -> OrthophotoSource:
     orthophoto = Orthophoto(path)
-    lattice = make_lattice(orthophoto, footprint_m, spacing_m, area)
-    return OrthophotoSource(orthophoto, [lattice], only=only)
+    return OrthophotoSource(orthophoto, [make_lattice(orthophoto, footprint_m, spacing_m, area)], only=only)
 
 
 def compute_offsets_m(lattice) -> np.ndarray:
@@ -142,8 +141,7 @@ def test_places_under_cloud_are_counted(tmp_path):
     with rasterio.open(path, "r+") as raster:
         raster.write(np.full((1, 200, 200), 240, np.uint8), window=rasterio.windows.Window(220, 220, 200, 200))
     source = open_grid(path, 100.0, 60.0)
-    frames = read_all_frames(source)
-    assert (len(frames), source.counts["white"]) == (16, 4)
+    assert (len(read_all_frames(source)), source.counts["white"]) == (16, 4)
 
 
 def test_orthophoto_source_cuts_each_place_at_several_footprints(tmp_path):
@@ -154,8 +152,7 @@ def test_orthophoto_source_cuts_each_place_at_several_footprints(tmp_path):
     assert {frame.pose.footprint_m for frame in frames if "_150m_" in frame.name} == {150.0}
     assert {frame.pose.footprint_m for frame in frames if "_100m_" in frame.name} == {100.0}
     grid = OrthophotoGrid(orthophoto=str(path), footprint_m=(100.0, 150.0), spacing_m=50.0)
-    again = grid.open(only=[frames[-1].name])
-    (one,) = read_all_frames(again)
+    (one,) = read_all_frames(grid.open(only=[frames[-1].name]))
     assert np.array_equal(one.image, frames[-1].image)
     with pytest.raises(UsageError, match="--footprint-m is 5000"):
         OrthophotoGrid(orthophoto=str(path), footprint_m=(100.0, 5000.0), spacing_m=50.0).open()

@@ -20,20 +20,16 @@ LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
 def ground():
     rng = np.random.default_rng(1)
     coarse = rng.integers(60, 200, (120, 120, 3), np.uint8)
-    fine = rng.integers(0, 50, (960, 960, 3), np.uint8)
-    return np.kron(coarse, np.ones((8, 8, 1), np.uint8)) + fine
+    return np.kron(coarse, np.ones((8, 8, 1), np.uint8)) + rng.integers(0, 50, (960, 960, 3), np.uint8)
 
 
 def fly(ground, pitch_deg, count=24):
     rng = np.random.default_rng(2)
     for number in range(count):
         drift_deg = rng.normal(0, 1, 2).tolist()
+        north_m = 20 + 6 * number
         pose = CameraPose(
-            east_m=120,
-            north_m=20 + 6 * number,
-            height_m=50,
-            heading_deg=5 * drift_deg[0],
-            pitch_deg=pitch_deg + drift_deg[1],
+            east_m=120, north_m=north_m, height_m=50, heading_deg=5 * drift_deg[0], pitch_deg=pitch_deg + drift_deg[1]
         )
         yield photograph(ground, 0.25, pose, CAMERA, LIGHT, rng)
 
@@ -73,6 +69,4 @@ def test_require_level_refuses_a_camera_that_is_tilted_otherwise_than_recorded(g
 
 
 def test_measure_tilt_is_unknown_without_overlap():
-    rng = np.random.default_rng(3)
-    images = rng.integers(0, 255, (20, 240, 320), np.uint8)
-    assert measure_tilt(images) is None
+    assert measure_tilt(np.random.default_rng(3).integers(0, 255, (20, 240, 320), np.uint8)) is None

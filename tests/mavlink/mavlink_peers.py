@@ -59,8 +59,7 @@ class Peer:
         self.send(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3), **sender)
 
     def answer_fix(self, result: int, command: int = 43003, to: int = 197, **sender: int) -> None:
-        ack = mavlink.MAVLink_command_ack_message(command, result, target_system=1, target_component=to)
-        self.send(ack, **sender)
+        self.send(mavlink.MAVLink_command_ack_message(command, result, target_system=1, target_component=to), **sender)
 
     def read(self) -> None:
         """Take what comes next."""

@@ -96,8 +96,7 @@ class Autopilot:
         self.conversation.handle(message.pack(packer), self.clock.now_s, address)
 
     def beat(self, base_mode=ARMED, **sender):
-        beat = mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3)
-        self.send(beat, **sender)
+        self.send(mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3), **sender)
 
     def position(self, lat_deg=50.0, lon_deg=8.0, hdg=9050, vx=0, vy=0, **sender):
         self.locate((lat_deg, lon_deg), 312.5, 80.0, (vx, vy, 0), hdg, **sender)
@@ -169,8 +168,7 @@ class Autopilot:
         for message in told:
             if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
                 nothing = [bytes(8)] * 3
-                version = mavlink.MAVLink_autopilot_version_message(0, 1 << 24 | 17 << 16, 0, 0, 0, *nothing, 0, 0, 0)
-                self.send(version)
+                self.send(mavlink.MAVLink_autopilot_version_message(0, 1 << 24 | 17 << 16, 0, 0, 0, *nothing, 0, 0, 0))
             if message.get_type() != "PARAM_REQUEST_READ" or is_lost(message):
                 continue
             if message.param_id in parameters:

@@ -132,8 +132,7 @@ def test_handle_ignores_an_unrequested_answer():
 def test_handle_replaces_older_answers_that_a_new_one_contradicts():
     """As after a pause of a simulated autopilot, or of our computer."""
     clock = learn((0.001, 0.001), (0.001, 0.001))
-    request = clock.make_request(1002.0)
-    assert not clock.handle(mavlink.MAVLink_timesync_message(round(401.5e9), request.ts1), 1002.2)
+    assert not clock.handle(mavlink.MAVLink_timesync_message(round(401.5e9), clock.make_request(1002.0).ts1), 1002.2)
     assert clock.boot_time_s(1002.1) == pytest.approx(401.5)
 
 

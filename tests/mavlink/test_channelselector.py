@@ -101,8 +101,7 @@ def test_parameters_that_the_autopilot_lacks_are_absent_after_some_rounds(firmwa
 
 def test_selector_treats_a_nonexistent_parameter_as_absent_at_once():
     px4 = {name: value for name, value in PX4.items() if "AGP" not in name}
-    autopilot = ParamPilot(px4, mavlink.MAV_AUTOPILOT_PX4, errors=True)
-    assert autopilot.answer_for(10, Channel.COMMAND) < 2
+    assert ParamPilot(px4, mavlink.MAV_AUTOPILOT_PX4, errors=True).answer_for(10, Channel.COMMAND) < 2
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5])

@@ -32,7 +32,7 @@ class Vehicle:
             if self.terrain_m is not None:
                 self._report_terrain()
             self.report(climb_m_s, vz_cm_s)
-        return self.reported_m
+        return self.autopilot.vehicle and self.autopilot.vehicle.height_m
 
     def report(self, climb_m_s=0.0, vz_cm_s=None):
         alt_m = GROUND_M + self.height_m + self.origin_m
@@ -50,11 +50,6 @@ class Vehicle:
         self.is_armed = True
         self.fly()
         return self.fly(height_m / 5, climb_m_s=5.0)
-
-    @property
-    def reported_m(self):
-        vehicle = self.autopilot.vehicle
-        return vehicle and vehicle.height_m
 
     def texts(self):
         texts = []

@@ -25,8 +25,7 @@ STATE = MotionState(
 
 def pack_and_unpack(message: Message) -> Message:
     """What the other end makes of it."""
-    packed = message.pack(mavlink.MAVLink(None, 1, 197))
-    (received,) = PacketReader().feed(packed)
+    (received,) = PacketReader().feed(message.pack(mavlink.MAVLink(None, 1, 197)))
     return received
 
 

@@ -111,8 +111,7 @@ def test_signing_accepts_unsigned_radio_status_but_not_as_the_autopilot(signing)
     [(-3600, {OLD: 1}), (-61, {OLD: 1}), (-59, {}), (59, {}), (61, {FUTURE: 1}), (3600, {FUTURE: 1})],
 )
 def test_signing_requires_a_new_stream_within_a_minute(signing, ahead_s, refused):
-    new = Signer(stamp=NOW + ahead_s * TICKS_S, link_id=1).packet()
-    admit(signing, Signer().packet(), new)
+    admit(signing, Signer().packet(), Signer(stamp=NOW + ahead_s * TICKS_S, link_id=1).packet())
     assert signing.refused == refused
 
 

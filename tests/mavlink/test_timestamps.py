@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 from fakes import FakeClock
@@ -87,11 +88,8 @@ def test_time_stamps_refuse_an_invalid_or_unwritable_file_in_one_sentence(path, 
 def test_time_stamps_continue_on_a_full_disk(path, monkeypatch, caplog):
     clock = FakeClock()
     stamps = make_stamps(path, clock=clock)
-
-    def raise_disk_full(*_):
-        raise OSError(28, "disk full")
-
-    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", raise_disk_full)
+    disk_full = OSError(28, "disk full")
+    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", Mock(side_effect=disk_full))
     tries = []
     monkeypatch.setattr("edgevpr.mavlink.signing.Thread.start", lambda thread: tries.append(thread.run()))
     first = stamps.next()

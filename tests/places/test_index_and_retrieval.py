@@ -85,8 +85,7 @@ def test_retrieve_compares_all_places_without_a_limit_of_candidates(ruler):
     query = technique.encode(43)
     everything = rank(technique, query, place_map, index)
     assert technique.compared == 25
-    found = load_candidates(everything, index, place_map, 3)
-    assert [c.place.source_image for c in found] == ["44", "40", "48"]
+    assert [c.place.source_image for c in load_candidates(everything, index, place_map, 3)] == ["44", "40", "48"]
     technique.compared = 0
     few = load_candidates(rank(technique, query, place_map, index, candidates=3), index, place_map)
     assert technique.compared == 3
@@ -127,8 +126,7 @@ def test_places_out_of_reach_are_no_candidates(ruler):
 
 def test_retrieve_finds_rivals_in_the_whole_map_for_a_single_place_in_reach(ruler):
     technique, place_map, index = ruler
-    query = technique.encode(20)
-    alone = rank(technique, query, place_map, index, 20, 40.0, reach_only(index, 80))
+    alone = rank(technique, technique.encode(20), place_map, index, 20, 40.0, reach_only(index, 80))
     assert len(alone.slots) == 1 + 5
     # The picture shows another place: the one in reach must not be taken for want of it.
     assert load_candidates(alone, index, place_map, 1)[0].place.source_image == "20"

@@ -41,8 +41,7 @@ def maps(tmp_path_factory):
 
 def open_index(technique, maps, tmp_path):
     """A technique, its map, and the index."""
-    path = shutil.copy(maps / type(technique).__name__, tmp_path / "m.gpkg")
-    with PlaceMap.open_for_writing(path) as place_map:
+    with PlaceMap.open_for_writing(shutil.copy(maps / type(technique).__name__, tmp_path / "m.gpkg")) as place_map:
         yield technique, place_map, load_index(place_map, technique, 10_000)
 
 
@@ -123,8 +122,7 @@ def test_place_left_out_may_be_correct_if_its_row_is_as_similar_as_the_best_or_i
     technique, place_map, index = ruler
     place_map.left_out[1 + number // 10] = "gone"
     query = dataclasses.replace(technique.encode(shown), coarse=np.array([101], "<f4"))
-    ranking = rank(technique, query, place_map, index)
-    assert (number // 10 in ranking.unread) is may_be_right
+    assert (number // 10 in rank(technique, query, place_map, index).unread) is may_be_right
 
 
 def test_retrieve_blames_the_file_if_most_places_are_unreadable_and_restores_all_with_it(ruler):

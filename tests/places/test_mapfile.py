@@ -34,8 +34,7 @@ def map_path(valley, tmp_path):
 def test_place_map_returns_what_was_added(map_path):
     with PlaceMap.open(map_path) as place_map:
         assert place_map.spec == SPEC
-        places = list(place_map.read_places())
-        for number, place in enumerate(places):
+        for number, place in enumerate(list(place_map.read_places())):
             added = frame(number)
             assert place.source_image == added.name
             assert place.t_utc_s == pytest.approx(added.t_utc_s, abs=1e-3)
@@ -211,14 +210,10 @@ def test_has_descriptor_tolerates_last_bits_but_not_another_image(map_path):
         for place_id in ids:
             coarse = next(part for number, _, _, part in place_map.read_coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
-                other = coarse + off * np.linalg.norm(coarse) * draw_unit_vector(rng, coarse.shape)
+                direction = rng.normal(0, 1, coarse.shape)
+                other = coarse + off * np.linalg.norm(coarse) * direction / np.linalg.norm(direction)
                 assert place_map.has_descriptor(place_id, other) is same
         assert not place_map.has_descriptor(10**6, coarse)
-
-
-def draw_unit_vector(rng, shape):
-    values = rng.normal(0, 1, shape)
-    return values / np.linalg.norm(values)
 
 
 def test_has_descriptor_tolerates_a_few_different_bytes(tmp_path):

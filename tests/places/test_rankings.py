@@ -67,8 +67,7 @@ def ranking(compared, rest=(), unread=()):
 
 def test_merge_rankings_keeps_the_better_match_of_a_place_in_both():
     one = ranking({4: 0.3, 7: 0.1}, rest=[(2, 0.09), (5, 0.08)])
-    other = ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3])
-    both = merge_rankings(one, other)
+    both = merge_rankings(one, ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3]))
     assert both.slots.tolist() == [7, 4, 2, 5, 9]
     np.testing.assert_allclose(both.scores, [0.5, 0.3, 0.06, 0.06, 0.05], rtol=1e-6)
     assert {slot: match.score for slot, match in both.compared.items()} == {4: 0.3, 7: 0.5, 2: 0.06}

@@ -84,8 +84,7 @@ def test_sequence_search_resolves_look_alikes_by_earlier_queries():
         scores[at, 7 + at] = 0.6
     scores[5, 30] = 0.7
     index = make_index(range(40))
-    best = [each.slots[0] for each in search_sequence(SequenceSearch(5), scores, index)]
-    assert best == [7, 8, 9, 10, 11, 12]
+    assert [each.slots[0] for each in search_sequence(SequenceSearch(5), scores, index)] == [7, 8, 9, 10, 11, 12]
 
 
 def test_sequence_matches_keep_the_shift_of_the_newest_query_and_score_the_sequence(scores):

@@ -55,8 +55,7 @@ def test_thermal_watch_treats_invalid_values_as_unknown(tree, nonsense):
 
 
 def test_thermal_watch_treats_a_falling_frequency_limit_as_throttling(tree):
-    root = tree(PI)
-    watch = ThermalWatch(root)
+    watch = ThermalWatch(tree(PI))
     assert watch.read().throttled is False
     tree({f"{POLICY}/scaling_max_freq": "1200000\n"})
     seen = watch.read()

@@ -64,9 +64,8 @@ def test_make_album_finds_only_images_in_the_given_folders(tmp_path):
 
 
 def test_flight_page_treats_names_in_the_log_as_text(tmp_path):
-    nasty = query(
-        HTML, reason={"code": "UNUSABLE", "parameters": {"problem": HTML}}, reference_image=HTML, accepted=False
-    )
+    reason = {"code": "UNUSABLE", "parameters": {"problem": HTML}}
+    nasty = query(HTML, reason=reason, reference_image=HTML, accepted=False)
     log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": HTML}))
     content = make_page(log)
     assert content.count("<script") == 2, "the data and the script of the page"

@@ -64,8 +64,7 @@ def run_autopilot(
     and accepts no fix. `parameters` are set before the start. Raises LinkError if the link cannot be opened, KeyError
     for an unknown parameter.
     """
-    motion = AlongTrack(track) if track else Motion()
-    controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
+    controller = FlightController(vehicle, AlongTrack(track) if track else Motion(), gps=gps, start_utc_s=time.time())
     for name, value in parameters.items():
         controller.set(name, value)
     return serve(controller, link_url, stop or threading.Event())

@@ -175,8 +175,7 @@ class Px4(Firmware):
         if self.origin is None:
             self.origin = (*point, message.alt)
             self._reset_to(point, sd_m)
-        gate_sd = parameters["EKF2_AGP0_GATE"]
-        self._fuse_or_reset(ours, point, sd_m, may_reset=not self._gps.is_active, gate_sd=gate_sd)
+        self._fuse_or_reset(ours, point, sd_m, may_reset=not self._gps.is_active, gate_sd=parameters["EKF2_AGP0_GATE"])
 
     def take_odometry(self, message: Message) -> None:
         """Fuse the position of an ODOMETRY in the local frame, as external vision (Ekf::controlEvPosFusion). Its time

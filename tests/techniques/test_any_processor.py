@@ -54,13 +54,10 @@ CHECKSUMS = {
 def compute_checksums(**environment):
     """Return the checksums of what a separate process makes of the pictures, by camera and picture."""
     asked = "import test_any_processor; test_any_processor.print_checksums()"
+    cwd = Path(__file__).parent
+    env = {**os.environ, **environment}
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", asked],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(__file__).parent,
-        env={**os.environ, **environment},
+        [sys.executable, "-W", "ignore", "-c", asked], capture_output=True, text=True, check=True, cwd=cwd, env=env
     )
     return dict(line.split(": ") for line in done.stdout.splitlines())
 

@@ -99,8 +99,7 @@ def test_find_regions_returns_the_most_energetic_connected_activations(dead, cou
 def test_equal_regions_are_sorted_by_channel_and_position():
     features = np.zeros((2, 5, 5), np.float32)
     features[:, 0, 4] = features[:, 0, 0] = features[:, 4, 2] = 1
-    boxes = regions.find_regions(features, 4)
-    assert boxes[:, :2].tolist() == [[0, 0], [0, 4], [4, 2], [0, 0]]
+    assert regions.find_regions(features, 4)[:, :2].tolist() == [[0, 0], [0, 4], [4, 2], [0, 0]]
 
 
 def test_score_mutual_pairs_equals_the_literal_loop():

@@ -108,8 +108,7 @@ def list_possible_rotations(by_hypothesis):
 def test_score_places_allows_only_rotations_near_the_expected_one(town):
     technique, rows = town
     query, rows = technique.encode(draw_view(0)), np.resize(rows, (8, PLACE_BYTES))
-    rotation_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
-    scores, by_rotation = technique.score_places(query, rows, None, rotation_deg)
+    scores, by_rotation = technique.score_places(query, rows, None, np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan]))
     sets = list_possible_rotations(by_rotation)
     assert sets[:3] == [[0, 15, 345], [0, 15, 345], [0, 15, 30]]
     assert sets[3:7] == [[90, 105, 120], [0, 330, 345], [0, 15, 345], [0, 15, 345]]

@@ -37,12 +37,8 @@ def draw_patterns(seed):
 @pytest.mark.parametrize(("rotation_deg", "right_px", "down_px", "height"), [(0, 24, -16, 1), (40, 8, 30, 1.2)])
 def test_overlay_query_follows_the_match(rotation_deg, right_px, down_px, height):
     ground = make_ground(1)
-    match = FineMatch(
-        0.1,
-        shift_cells=(right_px * CELLS / SIDE_PX, down_px * CELLS / SIDE_PX),
-        rotation_deg=rotation_deg,
-        height_ratio=height,
-    )
+    shift_cells = (right_px * CELLS / SIDE_PX, down_px * CELLS / SIDE_PX)
+    match = FineMatch(0.1, shift_cells=shift_cells, rotation_deg=rotation_deg, height_ratio=height)
     view = draw_view(ground, rotation_deg, right_px, down_px, height)
     laid, seen = overlay.overlay_query(view, ALLOWED, match, CELLS)
     assert 0.4 < seen.mean() < 1
@@ -52,8 +48,7 @@ def test_overlay_query_follows_the_match(rotation_deg, right_px, down_px, height
 
 def test_measure_prominence_is_low_for_another_structure():
     place = structure(draw_patterns(0), SEEN)
-    others = [overlay.measure_prominence(structure(draw_patterns(seed), SEEN), place) for seed in range(1, 41)]
-    assert max(others) < 2
+    assert max(overlay.measure_prominence(structure(draw_patterns(seed), SEEN), place) for seed in range(1, 41)) < 2
 
 
 def test_measure_prominence_is_low_along_a_linear_structure():

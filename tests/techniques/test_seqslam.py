@@ -32,10 +32,6 @@ def literal_enhanced(differences, window=10):
     return np.array(result)
 
 
-def encode_rows(technique, count, first=0):
-    return np.stack([technique.encode(draw_texture(first + seed)).coarse for seed in range(count)])
-
-
 def test_encode_makes_the_image_of_the_paper():
     technique = SeqSlam()
     picture = draw_texture(3)
@@ -51,8 +47,7 @@ def test_encode_makes_the_image_of_the_paper():
 
 def test_encode_ignores_light_and_contrast_and_marks_flat_patches():
     technique = SeqSlam()
-    rng = np.random.default_rng(1)
-    picture = rng.integers(0, 100, (32, 64), np.uint8)
+    picture = np.random.default_rng(1).integers(0, 100, (32, 64), np.uint8)
     np.testing.assert_array_equal(technique.encode(picture).coarse, technique.encode(2 * picture + 40).coarse)
     assert technique.encode(picture).quality == 1
     picture[:8, :16] = 7
@@ -63,7 +58,7 @@ def test_encode_ignores_light_and_contrast_and_marks_flat_patches():
 
 def test_score_places_equals_the_enhanced_differences_of_the_paper():
     technique = SeqSlam()
-    rows = encode_rows(technique, 40)
+    rows = np.stack([technique.encode(draw_texture(seed)).coarse for seed in range(40)])
     query = technique.encode(cv2.convertScaleAbs(draw_texture(17), alpha=0.7))
     scores, hypotheses = technique.score_places(query, rows, None)
     differences = [sum(abs(int(a) - int(b)) for a, b in zip(row, query.coarse, strict=True)) / 2048 for row in rows]

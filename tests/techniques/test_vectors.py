@@ -23,8 +23,7 @@ class Vectors(VectorTechnique):
 
 def make_vectors(count=40, seed=0, length=LENGTH):
     """Vectors with a large common part, as those of networks have."""
-    rng = np.random.default_rng(seed)
-    return (1.0 + rng.normal(0, 0.3, (count, length))).astype(np.float32)
+    return (1.0 + np.random.default_rng(seed).normal(0, 0.3, (count, length))).astype(np.float32)
 
 
 def make_rows(form, similarity, vectors):

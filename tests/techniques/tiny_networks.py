@@ -50,8 +50,7 @@ def write_card(path: Path, changes: dict) -> Path:
 
 
 def _network(fault: str | None):
-    rng = np.random.default_rng(1)
-    weights = rng.normal(0, 0.3, (FEATURES[0], 1, 5, 5)).astype(np.float32)
+    weights = np.random.default_rng(1).normal(0, 0.3, (FEATURES[0], 1, 5, 5)).astype(np.float32)
     bias = np.full(FEATURES[0], 0.2, np.float32)
     if fault == "nan":
         weights[1, 0, 2, 2] = np.nan

@@ -100,8 +100,7 @@ def test_match_triggers_does_not_shift_images_by_equal_intervals(clock_off_s, is
 @pytest.mark.parametrize("taken_s", [(1, 2, 3, 9, 11), (0, 1, 2, 3, 4, 5, 6)], ids=["other intervals", "too coarse"])
 def test_match_triggers_refuses_images_of_other_triggers(taken_s):
     images = {f"{t_s}": GeoTag(t_utc_s=START_S + t_s) for t_s in taken_s}
-    shots = [GeoTag(t_utc_s=START_S + t_s) for t_s in np.linspace(1, 6, 5)]
-    assert match_triggers(shots, images) is None
+    assert match_triggers([GeoTag(t_utc_s=START_S + t_s) for t_s in np.linspace(1, 6, 5)], images) is None
 
 
 def test_positions_assigns_images_by_time_if_their_number_differs(capsys, folder, tmp_path):
@@ -127,15 +126,14 @@ def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours, tr
 def test_positions_refuses_an_ambiguous_time_zone(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t, HOME[0], HOME[1] + 1e-6 * t) for t in range(4000, 20_000, 4)])
     assert "--offset-s" in expect_refusal(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
-    flags = ("--images", folder, "--offset-s", 7200)
-    assert run_json(capsys, "positions", tmp_path / "t.gpx", *flags)["placed"] == 6
+    placed = run_json(capsys, "positions", tmp_path / "t.gpx", "--images", folder, "--offset-s", 7200)["placed"]
+    assert placed == 6
 
 
 def test_positions_refuses_pictures_of_another_day_with_both_times(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t + 300_000, *HOME) for t in range(9)])
-    said = expect_refusal(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     day = (datetime.fromtimestamp(START_S, timezone.utc) + timedelta(seconds=300_000)).date().isoformat()
-    assert day in said
+    assert day in expect_refusal(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     assert not (folder / "positions.csv").exists()
 
 

@@ -1,5 +1,7 @@
 """The whole measurement on a small generated set."""
 
+from unittest.mock import Mock
+
 import cv2
 import pytest
 from generated_sets import make_set
@@ -72,10 +74,7 @@ def test_evaluate_ignores_a_loose_reference_and_counts_the_next(folder):
 
 
 def test_evaluate_reports_failed_steps_of_the_map(folder, monkeypatch):
-    def lack_scipy(*_):
-        raise UsageError("no SciPy")
-
-    monkeypatch.setattr(finishing, "calibrate_map", lack_scipy)
+    monkeypatch.setattr(finishing, "calibrate_map", Mock(side_effect=UsageError("no SciPy")))
     result = evaluate(folder, "cohog", COHOG)
     (note,) = result.not_done
     assert "no SciPy" in note

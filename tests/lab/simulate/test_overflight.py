@@ -63,8 +63,7 @@ def test_photograph_ground_shows_a_mark_like_a_pinhole_camera(orthophoto, change
 
 def test_photograph_ground_is_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
     rng = np.random.default_rng(0)
-    edge = move_position(HOME, 300, 0)
-    assert photograph_ground(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
+    assert photograph_ground(orthophoto, move_position(HOME, 300, 0), LEVEL, CAMERA, CLEAR, rng) is None
     for angle_deg in (58, 75):
         with pytest.raises(UsageError, match="horizon"):
             photograph_ground(orthophoto, HOME, replace(LEVEL, roll_deg=angle_deg), CAMERA, CLEAR, rng)
@@ -95,8 +94,7 @@ def test_read_shots_has_a_picture_for_each_line(tmp_path):
 
 def test_read_shots_follows_the_waypoints_of_a_mission(tmp_path):
     rows = [(0, 50.0, 11.9, 500), (3, 50.001, 11.9, 60), (3, 50.001, 11.902, 80)]
-    path = write_mission(tmp_path / "mission.waypoints", rows)
-    shots = read_shots(path, None, 10.0)
+    shots = read_shots(write_mission(tmp_path / "mission.waypoints", rows), None, 10.0)
     assert len(shots) == 1 + int((111.2 + 142.9) / 10)
     seconds = [shot.t_utc_s - shots[0].t_utc_s for shot in shots]
     assert seconds == pytest.approx(np.arange(len(shots)), abs=0.4), "it cuts the corner"
