@@ -8,7 +8,7 @@ from fakes import FakeClock, FakeLink, FakeSource
 from pictures import draw_texture
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.config import Config, load_config
+from edgevpr.core.config import load_config
 from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.power.thermal import ThermalWatch
@@ -22,7 +22,6 @@ from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.stop import Stop
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.recognise.recogniser import Recogniser
 
 PLACES = 30
 STEP_DEG = 0.001  # of latitude: 111 m
@@ -39,7 +38,8 @@ class Flight:
         self.board = resolve_board(load_board(self.config.board), self.config.source, self.config.memory)
         self.log, self.clock, self.link = log, clock, link
         self.recogniser = open_recogniser(self.config, self.board, uses_hints=True)
-        self.recogniser.meter = make_meter(self.config, self.recogniser, clock)
+        board, cpu_clock = self.recogniser.meter.board, clock.clock.process_cpu_s
+        self.recogniser.meter = QueryMeter(board, self.config.battery, wall_clock=clock, cpu_clock=cpu_clock)
         self.stop = Stop()
         self.end: dict = {}
 
@@ -60,9 +60,8 @@ class Flight:
             notifier, autopilot = Notifier(flight_log, self.link), None
             if self.link:
                 navigator = self.link.listener = Navigator(settings.min_accuracy_m, 1.0)
-                autopilot = AutopilotOutput(
-                    self.link, navigator, notifier, settings=settings, cores=self.board.cores, clock=clock
-                )
+                cores = self.board.cores
+                autopilot = AutopilotOutput(self.link, navigator, notifier, settings=settings, cores=cores, clock=clock)
             machine = Machine(measure_heat=ThermalWatch(hot_c=self.board.thermal_limit_c).read)
             parts = FlightParts(
                 recogniser=self.recogniser,
@@ -90,12 +89,6 @@ def prepare_flight(
 
 def draw_pictures(count: int, first: int = 0) -> list[Image]:
     return [draw_texture(first + number, 240, 320) for number in range(count)]
-
-
-def make_meter(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:
-    """The meter of queries by the flight's own clock."""
-    board = recogniser.meter.board
-    return QueryMeter(board, config.battery, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
 def make_flight_meter(flight: Flight, kind=FlightMeter, watch: ThermalWatch | None = None, **more) -> FlightMeter:

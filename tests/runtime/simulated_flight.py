@@ -147,18 +147,13 @@ class SimFlight:
             if self.stride_steps and not self.has_gps and self.step % self.stride_steps == 0 and not self.waiting:
                 self._take_frame(self.step, self.vehicle, is_query=False)
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
-                self._take_query(*self.waiting.popleft())
+                take = self.match if self.matches else self._take_frame
+                take(*self.waiting.popleft())
             if self.step % _STATE_STEPS == 0 and self.t_s >= self.between_due_s:
                 self._take_interim_fix(self.navigator.make_interim_fix(self.t_s))
             if self.step % 50 == 0:
                 self.errors_m.append(self.off_m)
         return self
-
-    def _take_query(self, step, vehicle) -> None:
-        if self.matches:
-            self.match(step, vehicle)
-        else:
-            self._take_frame(step, vehicle)
 
     def _take_frame(self, step, vehicle, is_query=True) -> None:
         frame = Frame(image=PICTURE, name="", t_mono_s=step * STEP_S)
@@ -182,8 +177,7 @@ class SimFlight:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
         event = make_match(where, step * STEP_S, vehicle, self.said_sd_m, self.places(step))
-        frame = replace(event.frame, t_sd_s=self.t_sd_s)
-        event = replace(event, frame=frame, odometry=self._measure_odometry(step))
+        event = replace(event, frame=replace(event.frame, t_sd_s=self.t_sd_s), odometry=self._measure_odometry(step))
         if self.shows_turn:
             picture = LevelledImage(PICTURE, None, replace(event.view, up_deg=0.0))
             located = replace(event.located, heading_deg=-math.degrees(self.turn))

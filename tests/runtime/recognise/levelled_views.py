@@ -23,6 +23,5 @@ def draw_ground(east_m: float, north_m: float) -> np.ndarray:
 def take_level_view(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None, scale=1.0) -> LevelledImage:
     """The levelled picture from a pose; `told` is the pose that the autopilot reports, `scale` corrects its height."""
     image = photograph(ground, _METRES_PER_PIXEL, pose, Camera(), _LIGHT, np.random.default_rng(1))
-    names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")
-    said = {name: getattr(told or pose, name) for name in names}
+    said = {name: getattr(told or pose, name) for name in ("heading_deg", "roll_deg", "pitch_deg", "height_m")}
     return level_image(Frame(image=image, name="", t_mono_s=0.0, **said), None, _LENS, FOOTPRINT_M, scale=scale)

@@ -59,13 +59,10 @@ def maps(ground, lenses, tmp_path_factory):
             tags[f"{number}.png"] = GeoTag(position=Position(*offset_position(*ORIGIN, 250.0, north_m)), **STRAIGHT)
         write_positions(folder / "positions.csv", tags)
         made[name] = str(folder / "map.gpkg")
+        pictures = FlightPictures(source=str(folder))
+        parameters = {"camera": "nadir"}
         order = MapPlan(
-            path=made[name],
-            pictures=FlightPictures(source=str(folder)),
-            technique="cohog",
-            parameters={"camera": "nadir"},
-            refine=False,
-            calibrate=False,
+            path=made[name], pictures=pictures, technique="cohog", parameters=parameters, refine=False, calibrate=False
         )
         make_map(order, load_config(None, {"source.lens": lenses[name]}), pytest.fail, lambda all_, *_: all_)
     return made

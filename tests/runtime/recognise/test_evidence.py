@@ -35,16 +35,12 @@ NEIGHBOUR_M = 50.0
 def rank(matches):
     """A ranking of matches by their slots, best first."""
     slots = sorted(matches, key=lambda slot: -matches[slot].score)
-    return Ranking(
-        slots=np.array(slots, int),
-        scores=np.array([matches[slot].score for slot in slots], np.float32),
-        compared=matches,
-    )
+    scores = np.array([matches[slot].score for slot in slots], np.float32)
+    return Ranking(slots=np.array(slots, int), scores=scores, compared=matches)
 
 
 def forward(score, back=0.2, likeness=0.7, log_rank=0.0):
-    support = Support(back=back, likeness=likeness, log_rank=log_rank)
-    return FineMatch(score, coverage=0.3, support=support)
+    return FineMatch(score, coverage=0.3, support=Support(back=back, likeness=likeness, log_rank=log_rank))
 
 
 def see_forward(matches, look_alikes=None):
@@ -139,8 +135,7 @@ def test_gather_evidence_measures_the_lead_over_places_elsewhere_not_neighbours(
 def test_forward_landmarks_are_evidence_only_beyond_rivals_and_chance(inliers, rival, times):
     proof = log_inlier_ratio(inliers, rival)
     assert proof == pytest.approx(math.log(times))
-    known = replace(see_forward({5: forward(0.2)}), proof=proof)
-    described = known.describe()
+    described = replace(see_forward({5: forward(0.2)}), proof=proof).describe()
     assert described["landmarks_ratio"] == (pytest.approx(times) if proof else None)
     assert (described["coverage_share"] is None) == bool(proof)
 
@@ -155,8 +150,7 @@ def test_forward_landmarks_are_evidence_only_beyond_rivals_and_chance(inliers, r
     ],
 )
 def test_landmarks_count_only_if_expected_and_shifted(proof, counts):
-    evidence = see_down({5: FineMatch(0.2, coverage=0.3)}, proof)
-    assert evidence.landmarks == pytest.approx(math.log1p(counts))
+    assert see_down({5: FineMatch(0.2, coverage=0.3)}, proof).landmarks == pytest.approx(math.log1p(counts))
 
 
 def test_gather_evidence_treats_a_place_of_the_same_ground_as_the_same_place():

@@ -20,9 +20,8 @@ PLACES = 4
 
 
 def frame(place, height_ratio=1.0):
-    return Frame(
-        image=draw_view(place, height_ratio), name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0)
-    )
+    image = draw_view(place, height_ratio)
+    return Frame(image=image, name=str(place), t_mono_s=0.0, position=Position(50 + place * 0.01, 8.0))
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +108,7 @@ def test_step_searches_the_places_whose_footprint_fits_the_height(two_footprint_
     walk = walk_over(place_map, noting, encoder={"levelling": levelling}, prior=prior)
     for place, ratio in ((1, 1.5), (3, 1.5), (2, 1.0), (0, 1.0)):
         del looked[:]
-        asked = replace(frame(place, ratio), height_m=height_m and ratio * height_m)
-        event = walk.step(asked)
+        event = walk.step(replace(frame(place, ratio), height_m=height_m and ratio * height_m))
         assert event.accepted, event.reason
         assert event.best.place.source_image.startswith(f"{place} ")
         if height_m or place in (3, 0):

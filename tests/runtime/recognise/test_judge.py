@@ -46,8 +46,7 @@ INVALID = Located(position=Position(47.0, 8.0), covariance_m2=(1.0, 0.0, 1.0), o
 
 @pytest.mark.parametrize(("confidence", "accepted"), [(1.0, True), (NEEDED, True), (0.8999, False), (math.nan, False)])
 def test_judge_accepts_a_match_from_the_required_confidence(confidence, accepted):
-    rule = make_rule(lambda evidence: confidence)
-    verdict = decide(rule=rule, evidence=CLEAR)
+    verdict = decide(rule=make_rule(lambda evidence: confidence), evidence=CLEAR)
     assert verdict.accepted is accepted
     assert verdict.reason.code is (ReasonCode.ACCEPTED_BY_CONFIDENCE if accepted else ReasonCode.LOW_CONFIDENCE)
     figures = {"confidence": confidence, "min_confidence": 0.9, "regions_ratio": math.exp(CLEAR.lead)}
@@ -216,8 +215,7 @@ def test_make_accept_rule_uses_limits_for_sequences_and_techniques_without_evide
 def test_judge_refuses_a_sequence_whose_newest_query_was_not_compared_with_the_place():
     search = SimpleNamespace(frames=2, length=2)
     ranking = Ranking(slots=np.array([0, 10]), scores=np.array([0.2, 0.1], np.float32), compared={10: FineMatch(0.1)})
-    verdict = judge(Findings(ranking), make_bare_index(30), RULE, search)
-    assert verdict.reason.code is ReasonCode.NEWEST_DISAGREES
+    assert judge(Findings(ranking), make_bare_index(30), RULE, search).reason.code is ReasonCode.NEWEST_DISAGREES
 
 
 @pytest.mark.parametrize(("rival", "accepted"), [(0.25, True), (0.26, False)])
@@ -345,5 +343,4 @@ def test_make_accept_rule_divides_the_margin_by_the_root_of_the_sequence_length(
         assert rule.min_margin == pytest.approx(technique.min_margin / math.sqrt(10))
     technique.min_margin = 1.0  # what is never to be accepted is not in a sequence either
     assert make_accept_rule(technique, config, 9).min_margin == 1.0
-    told = load_config(None, {"match.min_margin": 0.2}).match
-    assert make_accept_rule(technique, told, 9).min_margin == 0.2
+    assert make_accept_rule(technique, load_config(None, {"match.min_margin": 0.2}).match, 9).min_margin == 0.2

@@ -45,12 +45,10 @@ def frame(ground, place, t_mono_s=0.0, told=None, **pose):
     pose = LEVEL_POSE | pose
     heading, pitch = math.radians(pose["heading_deg"]), math.radians(pose["pitch_deg"])
     ahead_m = math.tan(pitch) * pose["height_m"]
-    where = CameraPose(
-        east_m=300 - ahead_m * math.sin(heading), north_m=NORTH_M[place] - ahead_m * math.cos(heading), **pose
-    )
-    image = photograph(
-        ground, 0.25, where, CAMERA, Light(sun_azimuth_deg=0, sun_elevation_deg=60), np.random.default_rng(0)
-    )
+    east_m = 300 - ahead_m * math.sin(heading)
+    where = CameraPose(east_m=east_m, north_m=NORTH_M[place] - ahead_m * math.cos(heading), **pose)
+    light = Light(sun_azimuth_deg=0, sun_elevation_deg=60)
+    image = photograph(ground, 0.25, where, CAMERA, light, np.random.default_rng(0))
     position = Position(50 + where.north_m / M_PER_DEG, 8.0)
     known = pose if told is None else told
     return Frame(image=image, name=f"{place}", t_mono_s=t_mono_s, position=position, **known)
@@ -307,8 +305,7 @@ def test_step_corrects_a_wrong_recorded_height_after_the_first_match(walk, groun
 
 @pytest.mark.parametrize("lens", [LENS, None])
 def test_step_corrects_a_wrong_reported_height_after_the_first_match(walk, ground, technique, lens):
-    levelling = Levelling(lens, is_live=False)
-    follow = walk(levelling, Prior(None, technique.spec.heading_within_deg, is_live=False))
+    follow = walk(Levelling(lens, is_live=False), Prior(None, technique.spec.heading_within_deg, is_live=False))
     told = LEVEL_POSE | {"height_m": 1.25 * HEIGHT_M}
     first, second = (
         follow.step(frame(ground, place, told=told, height_m=1.25 * HEIGHT_M if lens is None else HEIGHT_M))
@@ -316,8 +313,7 @@ def test_step_corrects_a_wrong_reported_height_after_the_first_match(walk, groun
     )
     assert is_recognised(first, 3)
     assert is_recognised(second, 2)
-    shown = 1.25 if lens is None else 0.8
-    assert first.best.match.height_ratio == pytest.approx(shown, rel=0.04)
+    assert first.best.match.height_ratio == pytest.approx(1.25 if lens is None else 0.8, rel=0.04)
     assert second.best.match.height_ratio == pytest.approx(1.0 if lens else 1.42, rel=0.04)
     assert second.view.zoom == pytest.approx(1.0 if lens else 1.25 / 1.42, rel=0.04)
     if lens:

@@ -110,8 +110,7 @@ def test_locate_averages_places_of_the_same_ground():
 
 def test_locate_refuses_contradicting_places():
     candidates = [make_candidate(1, shift=(4, 0)), make_candidate(2, east_m=22)]
-    found = locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0)))
-    assert found.objection.code is ReasonCode.POSITIONS_DISAGREE
+    assert locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0))).objection.code is ReasonCode.POSITIONS_DISAGREE
 
 
 def test_locate_skips_a_slightly_inconsistent_place_without_objection():

@@ -77,8 +77,7 @@ def test_odometry_is_scaled_by_a_wrong_height_and_rotated_by_a_wrong_compass(gro
 
 def test_odometry_is_none_if_it_cannot_be_measured(ground):
     first, second = take_view(ground, START), take_view(ground, replace(START, east_m=215.0))
-    elsewhere = take_view(ground, replace(START, east_m=60.0, north_m=330.0))
-    assert measure_odometry(first, elsewhere) is None
+    assert measure_odometry(first, take_view(ground, replace(START, east_m=60.0, north_m=330.0))) is None
     assert measure_odometry(first, second, after_s=40.0) is None
     assert measure_odometry(first, second, after_s=0.0) is None
     assert measure_odometry(first, (UNKNOWN_VIEW, second[1])) is None
@@ -105,8 +104,7 @@ def test_odometry_measures_a_jump_of_the_reported_height(ground):
 
 
 def test_odometry_is_none_over_repetitive_or_featureless_ground():
-    rng = np.random.default_rng(2)
-    tile = cv2.GaussianBlur(rng.uniform(0, 255, (40, 40)).astype(np.float32), (0, 0), 2)
+    tile = cv2.GaussianBlur(np.random.default_rng(2).uniform(0, 255, (40, 40)).astype(np.float32), (0, 0), 2)
     tile = cv2.normalize(tile, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     repeated = np.repeat(np.tile(tile, (40, 40))[..., None], 3, 2)
     second = replace(START, east_m=217.0)

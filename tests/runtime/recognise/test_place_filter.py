@@ -80,9 +80,8 @@ class Flight:
         where = None
         if self.has_poses:
             number = int(self.index.place_ids[best])
-            where = Located(
-                position=to_position(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,)
-            )
+            position = to_position(place)
+            where = Located(position=position, covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
         return self.follower.update(
             Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where, VIEW
         )
@@ -176,9 +175,8 @@ def test_positions_are_those_of_the_places(posed_map, bare_map):
 def test_place_filter_does_not_count_a_place_of_the_same_position_as_another(posed_map):
     where = Located(position=to_position(20), covariance_m2=(9.0, 0.0, 9.0), places=(121, 141))
     slots = np.array([20, 40])
-    ranking = Ranking(
-        slots=slots, scores=np.array([0.3, 0.3], np.float32), compared={20: FineMatch(0.3), 40: FineMatch(0.3)}
-    )
+    scores = np.array([0.3, 0.3], np.float32)
+    ranking = Ranking(slots=slots, scores=scores, compared={20: FineMatch(0.3), 40: FineMatch(0.3)})
     follower = PlaceFilter(posed_map, max_speed_m_s=None, is_live=True)
     rule = make_model(lambda evidence: 0.6, lambda evidence: 0.9)
     followed = follower.update(ranking, METRIC_INDEX, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), rule, where, VIEW)
@@ -280,5 +278,4 @@ def test_place_filter_recovers_from_a_wrong_estimate(posed_map, moved_m):
 def test_place_filter_never_confirms_one_of_several_twins(posed_map):
     flight = Flight(posed_map, METRIC_INDEX)
     for place in range(20, 60, STRIDE):
-        followed = flight.query(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)
-        assert followed.confidence < 0.9
+        assert flight.query(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M).confidence < 0.9

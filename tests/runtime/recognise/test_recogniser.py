@@ -1,6 +1,7 @@
 """The walk of a frame: what it gives, and that no fault of a frame, a place or a technique leaves it."""
 
 import shutil
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -28,8 +29,7 @@ def frame(number, t_mono_s=0.0):
 
 @pytest.fixture(scope="module")
 def whole_map(tmp_path_factory):
-    path = tmp_path_factory.mktemp("map") / "m.gpkg"
-    return make_map(path, create("cohog", {"w1": 208}), map(frame, range(PLACES)))
+    return make_map(tmp_path_factory.mktemp("map") / "m.gpkg", create("cohog", {"w1": 208}), map(frame, range(PLACES)))
 
 
 @pytest.fixture
@@ -76,11 +76,8 @@ class LibraryError(Exception):
 )
 @pytest.mark.parametrize("where", ["encode", "score_places", "match"])
 def test_step_refuses_with_the_reason_of_any_exception_of_a_technique(walk, error, where):
-    def raise_error(*asked, **more):
-        raise error
-
     whole = getattr(walk.technique, where)
-    setattr(walk.technique, where, raise_error)
+    setattr(walk.technique, where, Mock(side_effect=error))
     event = walk.step(frame(1))
     assert (event.failed, event.accepted, event.position) == (True, False, None)
     assert event.is_query == (where != "encode")
@@ -95,10 +92,7 @@ def test_step_lets_a_stop_pass(walk):
     class Stop(BaseException):
         pass
 
-    def raise_stop(*asked):
-        raise Stop
-
-    walk.technique.encode = raise_stop
+    walk.technique.encode = Mock(side_effect=Stop)
     with pytest.raises(Stop):
         walk.step(frame(1))
 

@@ -121,8 +121,7 @@ def test_tracked_hover_keeps_recognising_its_place(whole_map):
 def test_tracked_flight_survives_blank_and_unusable_images(flight):
     for place in range(1, 16, STRIDE):
         flight.query(place)
-    flat = np.full((120, 160), 90, np.uint8)
-    event = flight.query(17, elapsed_s=1.0, image=flat)
+    event = flight.query(17, elapsed_s=1.0, image=np.full((120, 160), 90, np.uint8))
     assert (event.lacks_texture, event.accepted, event.track) == (True, False, None)
     assert flight.recogniser.step(Frame(image=None, name="none", t_mono_s=0.0)).failed
     assert any(flight.query(place).accepted for place in (19, 22))

@@ -69,8 +69,7 @@ def store(path, landmarks, checksum):
 def run_query(path, technique, query, rule=RULE, times=1, search=None):
     """The event of a query; of the last, where it is asked several times."""
     with PlaceMap.open(path) as place_map:
-        settings = MatchSettings(candidates=technique.candidates)
-        walk = walk_over(place_map, technique, rule, search, settings=settings)
+        walk = walk_over(place_map, technique, rule, search, settings=MatchSettings(candidates=technique.candidates))
         return [walk.step(query) for _ in range(times)][-1]
 
 

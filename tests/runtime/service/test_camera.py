@@ -69,8 +69,7 @@ def test_check_camera_finds_a_program_that_has_it_open(root):
 
 
 def test_check_frame_compares_the_frame_with_the_lens(tmp_path):
-    camera = make_wide_camera()
-    lens = str(camera.write(tmp_path / "lens.yaml"))
+    lens = str(make_wide_camera().write(tmp_path / "lens.yaml"))
     folder = tmp_path / "images"
     folder.mkdir()
     grey = np.zeros((480, 640), np.uint8)

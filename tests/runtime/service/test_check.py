@@ -160,8 +160,7 @@ def test_check_waits_for_a_frame_and_a_heartbeat(settings, config_file, capsys):
     config_file.write_text(yaml.safe_dump(settings))
     with start_autopilot(settings, system_id=7) as autopilot:
         assert main(["check", "--config", str(config_file)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[1] for line in lines] == ITEMS
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ITEMS
     assert autopilot.names() <= {"HEARTBEAT"}
 
 

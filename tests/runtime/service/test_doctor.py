@@ -96,8 +96,7 @@ def test_check_autopilot_accepts_each_source_of_position(vehicle, parameters):
 @pytest.mark.parametrize("vehicle", ["copter", "rover", "vehicle"])
 @pytest.mark.parametrize("changes", [PLAIN, {"FLOW_TYPE": 6}, {"FLOW_TYPE": 0, "EK3_SRC1_VELXY": 5}, {"VISO_TYPE": 2}])
 def test_check_autopilot_requires_a_second_receiver_without_another_source(vehicle, changes):
-    found = find_faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | changes))
-    assert found == {"channel": ("GPS2_TYPE=14",)}
+    assert find_faults(replace(COPTER, vehicle=vehicle, parameters=PLAIN | changes)) == {"channel": ("GPS2_TYPE=14",)}
     assert find_faults(HOVERING) == {"channel": ("GPS2_TYPE=14",)}
 
 
@@ -198,8 +197,7 @@ def test_check_autopilot_accepts_a_constant_position_of_px4_alone():
 
 
 def test_check_autopilot_wants_px4_to_use_message_296():
-    bare = set_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
-    assert find_faults(bare) == {
+    assert find_faults(set_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)) == {
         "channel": ("EKF2_AGP0_CTRL=1",),
         "EKF2_AGP0_DELAY": ("EKF2_AGP0_DELAY=0",),
         "EKF2_AGP0_ID": ("EKF2_AGP0_ID=1",),
@@ -209,9 +207,8 @@ def test_check_autopilot_wants_px4_to_use_message_296():
 
 def test_check_autopilot_wants_odometry_of_a_px4_without_message_296():
     without = replace(PX4, parameters={})
-    assert (
-        find_faults(without) == find_faults(set_parameters(without, EKF2_OF_CTRL=1)) == {"channel": ("EKF2_EV_CTRL=1",)}
-    )
+    with_flow = set_parameters(without, EKF2_OF_CTRL=1)
+    assert find_faults(without) == find_faults(with_flow) == {"channel": ("EKF2_EV_CTRL=1",)}
     (others,) = (each for each in check_autopilot(set_parameters(without, EKF2_EV_CTRL=15), UDP, FIXES) if not each.ok)
     assert (others.changes, others.reason.parameters["value"]) == (("EKF2_EV_CTRL=1",), 15)
     assert find_faults(set_parameters(without, EKF2_EV_CTRL=1)) == {}
@@ -289,8 +286,7 @@ def test_doctor_over_a_link_only_reads(link, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with serve_peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}) as autopilot:
         code = main(["doctor", "--link", link])
-    found = parse_findings(capsys.readouterr().out)
-    assert [what for what, ok in found.items() if not ok] == []
+    assert [what for what, ok in parse_findings(capsys.readouterr().out).items() if not ok] == []
     assert code == 0
     assert list(tmp_path.iterdir()) == []
     assert autopilot.names() == {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ"}
@@ -320,8 +316,7 @@ def test_doctor_waits_for_a_frame_of_the_camera(link, capsys, tmp_path):
     config.write_text(f"source: {{uri: 'tcp://127.0.0.1:{free_port()}'}}\nlog: {{path: null}}\n")
     with serve_peer(link, parameters=PLAIN | {"GPS2_TYPE": 14}):
         assert main(["doctor", "--config", str(config), "--link", link]) == 1
-    found = parse_findings(capsys.readouterr().out)
-    assert [what for what, ok in found.items() if not ok] == ["frames"]
+    assert [what for what, ok in parse_findings(capsys.readouterr().out).items() if not ok] == ["frames"]
 
 
 @pytest.mark.network

@@ -125,8 +125,7 @@ def test_run_breaks_off_a_long_query(recording, tmp_path):
             time.sleep(0.02)
         run.terminate()
         finish_flight(run)
-    lines = list(read_log(log))
-    assert [line["kind"] for line in lines] == ["start", "end"], "what is broken off is no query"
+    assert [line["kind"] for line in read_log(log)] == ["start", "end"], "what is broken off is no query"
 
 
 def test_run_notifies_systemd(fly, tmp_path):
@@ -143,8 +142,7 @@ def test_run_notifies_systemd(fly, tmp_path):
 
 def test_run_puts_a_relative_log_into_the_folder_of_logs(fly, tmp_path):
     (tmp_path / "logs").mkdir()
-    run = fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs"))
-    finish_flight(run)
+    finish_flight(fly("--rate-hz", "60", log="own.jsonl", LOGS_DIRECTORY=str(tmp_path / "logs")))
     assert list(read_log(tmp_path / "logs" / "own.jsonl"))[-1]["kind"] == "end"
 
 

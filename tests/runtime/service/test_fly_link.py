@@ -18,8 +18,7 @@ from edgevpr.runtime.flight.navigator import Navigator
 
 
 def test_open_link_uses_the_keys_of_the_configuration():
-    keys = {"mavlink.system_id": 5, "mavlink.component_id": 191, "mavlink.max_fix_age_s": 0.2}
-    config = load_config(None, keys)
+    config = load_config(None, {"mavlink.system_id": 5, "mavlink.component_id": 191, "mavlink.max_fix_age_s": 0.2})
     world = SimpleNamespace(turns=Turns(time.monotonic), drive=PortDriver, signing=NOT_SIGNING)
     with ExitStack() as stack:
         port = stack.enter_context(closing(UdpPort()))

@@ -33,9 +33,8 @@ def start_hanging_flight(recording, tmp_path):
         run = ["run", "--map", recording / "cohog.gpkg", "--source", "/dev/video0", "--log", tmp_path / "f.jsonl"]
         flags = ["--rate-hz", "5", "--config", tmp_path / "c.yaml"]
         command = [sys.executable, HANGING, step, tmp_path / "mark", *run, *flags]
-        flight = subprocess.Popen(
-            list(map(str, command)), stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}
-        )
+        env = {**os.environ, **environment}
+        flight = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True, env=env)
         flights.append(flight)
         wait_until((tmp_path / "mark").exists)
         return flight

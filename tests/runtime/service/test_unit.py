@@ -70,8 +70,7 @@ def test_unit_file_in_deploy_is_that_of_the_default_board():
 
 
 def test_render_unit_has_the_limits_of_the_board():
-    board = replace(load_board("rpi-zero-2w"), name="mine", cores=8, cpu_share=0.3, memory_max_mb=777.0)
-    unit = render_unit(board)
+    unit = render_unit(replace(load_board("rpi-zero-2w"), name="mine", cores=8, cpu_share=0.3, memory_max_mb=777.0))
     assert read_directives(unit)["MemoryMax"] == "777000000"
     assert read_directives(unit)["CPUQuota"] == "240%"
     assert read_directives(unit)["ExecStart"] == "/opt/edgevpr/bin/edgevpr run --config /etc/edgevpr/config.yaml"
