@@ -36,9 +36,8 @@ def add(commands: Any) -> None:
     flight.add_argument("--seed", type=_parse_seed, default=1, metavar="N", help=text)
     orthophoto = flight.add_argument_group("over an orthophoto")
     orthophoto.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")
-    orthophoto.add_argument(
-        "--track", metavar="FILE", help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]"
-    )
+    text = "mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]"
+    orthophoto.add_argument("--track", metavar="FILE", help=text)
     for name, (*_, text) in _NUMBER_FLAGS.items():
         orthophoto.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
     demo = shared.add_command(commands, "demo", run_demo, "map a generated flight, match a later one, and draw results")
@@ -72,12 +71,9 @@ def run_eval(args: Namespace) -> int:
     from edgevpr.lab.evaluate.tables import format_results
 
     config, rows, sets = shared.make_config(args, args.config), _list_rows(args), _open_sets(args)
+    match = config.match
     options = MatchOptions(
-        candidates=config.match.candidates,
-        sequence=config.match.sequence,
-        exact=args.exact,
-        follow=args.follow,
-        known=args.known,
+        candidates=match.candidates, sequence=match.sequence, exact=args.exact, follow=args.follow, known=args.known
     )
     outcome = measure(sets, rows, options, config.salience, progress)
     content = outcome.as_json()

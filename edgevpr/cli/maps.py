@@ -78,20 +78,11 @@ def _add_build(build: ArgumentParser) -> None:
 
 
 def _add_subset(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "--mission",
-        metavar="FILE",
-        required=True,
-        help="Mission Planner waypoints, QGroundControl .plan, or LAT,LON,RADIUS_M",
-    )
+    text = "Mission Planner waypoints, QGroundControl .plan, or LAT,LON,RADIUS_M"
+    parser.add_argument("--mission", metavar="FILE", required=True, help=text)
     parser.add_argument("--out", metavar="MAP", required=True, help="map to write")
-    parser.add_argument(
-        "--margin-m",
-        type=shared.parse_positive,
-        metavar="M",
-        default=_MISSION_MARGIN_M,
-        help="margin around the mission in metres (default: %(default)g)",
-    )
+    text = "margin around the mission in metres (default: %(default)g)"
+    parser.add_argument("--margin-m", type=shared.parse_positive, metavar="M", default=_MISSION_MARGIN_M, help=text)
     parser.add_argument("--mb", type=shared.parse_positive, metavar="MB", help="maximum size in MB (default: no limit)")
     shared.add_json(parser)
 
@@ -101,23 +92,12 @@ def _add_pictures(parser: ArgumentParser) -> None:
     shared.add_recording(parser, required=False)
     flags = parser.add_argument_group("from an orthophoto, instead of --images")
     flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT or MBTiles file")
-    flags.add_argument(
-        "--footprint-m",
-        type=_parse_lengths,
-        metavar="M",
-        help="ground covered by the longest side of an image, in metres; a list for several heights: 75,105,150",
-    )
-    flags.add_argument(
-        "--spacing-m",
-        type=float,
-        metavar="M",
-        help="distance between places in metres, for example a quarter of the footprint",
-    )
-    flags.add_argument(
-        "--area",
-        metavar="AREA",
-        help="area to map: a mission (its path and a footprint on either side), or LAT,LON,RADIUS_M",
-    )
+    text = "ground covered by the longest side of an image, in metres; a list for several heights: 75,105,150"
+    flags.add_argument("--footprint-m", type=_parse_lengths, metavar="M", help=text)
+    text = "distance between places in metres, for example a quarter of the footprint"
+    flags.add_argument("--spacing-m", type=float, metavar="M", help=text)
+    text = "area to map: a mission (its path and a footprint on either side), or LAT,LON,RADIUS_M"
+    flags.add_argument("--area", metavar="AREA", help=text)
 
 
 def _parse_lengths(text: str) -> tuple[float, ...]:
@@ -255,8 +235,7 @@ def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, fl
             if (picture := pictures.level_picture(place, lens))
         )
         look_alikes = list(find_look_alikes(place_map, queries))
-    name = Path(args.map).name
-    page = make_map_page(name, lines, places, recognisable, look_alikes, pictures, lens)
+    page = make_map_page(Path(args.map).name, lines, places, recognisable, look_alikes, pictures, lens)
     shared.write_output(args.page, args.map, page)
     if not args.json:
         print(f"{args.page}: {len(places)} places of {args.map}")

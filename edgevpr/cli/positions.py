@@ -18,12 +18,8 @@ def add(commands: Any) -> None:
         "table from exiftool, Pix4D, Metashape or OpenDroneMap",
     )
     parser.add_argument("--images", required=True, metavar="SOURCE", help="folder of images, or video file")
-    parser.add_argument(
-        "--offset-s",
-        type=float,
-        metavar="S",
-        help="seconds to add to the camera's clock or to the times of subtitles (default: inferred time-zone offset)",
-    )
+    text = "seconds to add to the camera's clock or to the times of subtitles (default: inferred time-zone offset)"
+    parser.add_argument("--offset-s", type=float, metavar="S", help=text)
     text = "file to write (default: positions.csv in the folder, or VIDEO.csv)"
     parser.add_argument("--out", metavar="CSV", help=text)
     add_json(parser)

@@ -16,9 +16,8 @@ def add(commands: Any) -> None:
     subject.add_argument("--map", metavar="MAP", help="map of the flight: estimate the costs of its technique")
     subject.add_argument("--places", type=parse_count, metavar="N", help="number of places: estimate every technique")
     parser.add_argument("--board", default="this", metavar="NAME", help="board; see --list (default: this computer)")
-    parser.add_argument(
-        "--flight-min", type=parse_positive, default=20.0, metavar="MIN", help="flight length in minutes (default: 20)"
-    )
+    text = "flight length in minutes (default: 20)"
+    parser.add_argument("--flight-min", type=parse_positive, default=20.0, metavar="MIN", help=text)
     add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
     add_json(parser)
 

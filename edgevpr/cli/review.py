@@ -16,13 +16,8 @@ def add(commands: Any) -> None:
     report.add_argument("log", metavar="LOG")
     report.add_argument("--out", required=True, metavar="FILE", help="page to write (.html)")
     report.add_argument("--map", metavar="MAP", help="map to draw (default: the map of the flight)")
-    report.add_argument(
-        "--images",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="folder of this flight's frames (repeatable), or its video; not needed if the flight was recorded",
-    )
+    text = "folder of this flight's frames (repeatable), or its video; not needed if the flight was recorded"
+    report.add_argument("--images", action="append", default=[], metavar="DIR", help=text)
     add_map_images(report)
     replay = add_command(commands, "replay", run_replay, "replay a recorded flight and compare log and packets")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
@@ -53,8 +48,7 @@ def run_report(args: Namespace) -> None:
     upright = not any(place.pose for place in ground)  # only maps of a camera that looks down have poses
     frames = make_album(args.images, list_frames(folder) if folder else {}, upright=upright)
     references = make_map_album(args.map_images, ground, upright=upright)
-    page = make_flight_page(flight, ground, frames, references, no_ground)
-    write_output(args.out, args.log, page)
+    write_output(args.out, args.log, make_flight_page(flight, ground, frames, references, no_ground))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
 
 

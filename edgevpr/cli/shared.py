@@ -85,13 +85,8 @@ def add_positions(parser: argparse.ArgumentParser) -> None:
 
 def add_map_images(parser: argparse.ArgumentParser) -> None:
     """Add the flag for the pictures that a map was built from, for pages that show them."""
-    parser.add_argument(
-        "--map-images",
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="images (folder, repeatable), video or orthophoto that the map was built from",
-    )
+    text = "images (folder, repeatable), video or orthophoto that the map was built from"
+    parser.add_argument("--map-images", action="append", default=[], metavar="DIR", help=text)
 
 
 def add_known(parser: argparse.ArgumentParser) -> None:
