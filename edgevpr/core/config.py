@@ -235,8 +235,7 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
     {"source.rate_hz": 2.0}; None values are ignored. Raises ConfigError that names the file, the key and the remedy."""
     from edgevpr.core.yamlfile import read_yaml  # loads PyYAML, which listing the flags does not need
 
-    config = Config() if path is None else build(Config, read_yaml(path), str(path))
-    mapping = asdict(config)
+    mapping = asdict(Config() if path is None else build(Config, read_yaml(path), str(path)))
     for dotted, value in (overrides or {}).items():
         if value is not None:
             *sections, name = dotted.split(".")

@@ -49,9 +49,7 @@ def _escape_character(character: str) -> str:
 
 def redact_passwords(text: str) -> str:
     """Replace passwords and keys in the addresses in a text with ***: rtsp://user:***@host/path?token=***."""
-    if ":/" not in text:
-        return text
-    return _SECRET.sub(r"\1***", _PASSWORD.sub(r"\1:***@", text))
+    return text if ":/" not in text else _SECRET.sub(r"\1***", _PASSWORD.sub(r"\1:***@", text))
 
 
 def sanitize(text: str, keep: str = "") -> str:

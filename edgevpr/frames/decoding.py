@@ -145,12 +145,9 @@ class VideoDecoder:
     def facts(self) -> StreamFacts:
         """The stream's own description of its images; available once one has been decoded."""
         aspect, rate = self._codec.sample_aspect_ratio, self.stream.average_rate
-        return StreamFacts(
-            codec=self._codec.name,
-            bits=self._codec.format.components[0].bits if self._codec.format else 8,
-            pixel_aspect=float(aspect or 1),
-            rate_hz=float(rate) if rate and self.is_stamped else None,
-        )
+        bits = self._codec.format.components[0].bits if self._codec.format else 8
+        rate_hz = float(rate) if rate and self.is_stamped else None
+        return StreamFacts(codec=self._codec.name, bits=bits, pixel_aspect=float(aspect or 1), rate_hz=rate_hz)
 
     def fetch(self) -> TimedPacket | None:
         """Wait for the next packet and return it; None at the end, or if the stream is lost. One thread may fetch

@@ -45,12 +45,9 @@ def read_exif(path: str | Path) -> GeoTag:
         return None
 
     position, alt_m = read_first(_read_position), read_first(_read_alt_m)
-    return replace(
-        xmp,
-        position=position and replace(position, alt_m=alt_m),
-        heading_deg=read_first(_read_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
-        t_utc_s=read_first(_read_gps_time_s, _read_camera_time_s),
-    )
+    heading_deg = read_first(_read_heading_deg) if xmp.heading_deg is None else xmp.heading_deg
+    t_utc_s = read_first(_read_gps_time_s, _read_camera_time_s)
+    return replace(xmp, position=position and replace(position, alt_m=alt_m), heading_deg=heading_deg, t_utc_s=t_utc_s)
 
 
 def read_fov_deg(path: str | Path) -> float | None:

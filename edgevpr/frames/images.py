@@ -63,8 +63,7 @@ def is_image(name: str) -> bool:
 
 def make_sort_key(name: str) -> tuple[list[str | int], str]:
     """Return the sort key of a file name; numbers within names sort in numeric order (2 before 10)."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name.lower()))], name
 
 
 def read_image(path: str | Path, depth: DepthRange | None = None, *, upright: bool = True) -> Image:

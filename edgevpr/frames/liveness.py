@@ -84,9 +84,7 @@ class Liveness:
         if silent_s > limit_s and is_late:
             # Before the first picture, it may still wait for a key frame, or for enough pictures to estimate their age.
             return Fault(Condition.LATE, _LATE_TEXT, silent_s > _LATE_REOPEN_S)
-        if silent_s > limit_s:
-            return Fault(Condition.LOST, "lost: no new picture", True)
-        return None
+        return Fault(Condition.LOST, "lost: no new picture", True) if silent_s > limit_s else None
 
     def record_reopening(self, fault: Fault) -> None:
         """Record that the source is being reopened because of this fault."""

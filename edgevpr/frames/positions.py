@@ -249,12 +249,10 @@ class Track:
         weight = (t_s - self.t_s[upper - 1]) / (self.t_s[upper] - self.t_s[upper - 1])
         numbers: list[Any] = [None if math.isnan(number) else number for number in (earlier + weight * change).tolist()]
         lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = numbers
+        position = Position(lat_deg, wrap_deg(lon_deg), alt_m)
+        heading_deg = None if heading_deg is None else heading_deg % 360
         return GeoTag(
-            position=Position(lat_deg, wrap_deg(lon_deg), alt_m),
-            heading_deg=None if heading_deg is None else heading_deg % 360,
-            roll_deg=roll_deg,
-            pitch_deg=pitch_deg,
-            height_m=height_m,
+            position=position, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m
         )
 
     def require_overlap(self, video: Path, duration_s: float) -> None:

@@ -126,9 +126,7 @@ class Fixes:
         """Return the reason why no fix may be sent now; None if fixes may be sent."""
         if self._consecutive_unanswered >= MAX_UNANSWERED and now_s - self._sent_s < RETRY_INTERVAL_S:
             return Reason(ReasonCode.FIXES_UNANSWERED)
-        if now_s < self._resumes_s:
-            return Reason(ReasonCode.ANSWERS_RESUMED)
-        return None
+        return Reason(ReasonCode.ANSWERS_RESUMED) if now_s < self._resumes_s else None
 
     def record_sent(self, transmission: FixTransmission, now_s: float) -> None:
         """Record that a fix was handed to the port."""

@@ -138,8 +138,7 @@ class PlaceMap(MapConnection):
             with self._skip_unreadable(place_id):
                 content = rows.read_columns(_COARSE_COLUMNS, row)
                 point, heading_deg = rows.parse_position(content)
-                part = rows.decode_part(content, "coarse", self.spec.coarse)
-                yield place_id, point, heading_deg, part
+                yield place_id, point, heading_deg, rows.decode_part(content, "coarse", self.spec.coarse)
 
     def compute_mean_coarse(self) -> Singles:
         """Return the mean of all readable coarse parts, float32 of the shape of one part."""

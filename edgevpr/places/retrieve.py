@@ -186,13 +186,9 @@ class _Comparison:
             heights = max(len(self._query.technique.spec.height_ratios), 1)
             tried_per_slot = np.isfinite(self._hypothesis_scores[slots]).mean(axis=1) * heights
             tried = float(np.minimum(tried_per_slot, 1.0).mean())
-        return Ranking(
-            slots=np.append(slots, [slot for _, slot in skipped]).astype(np.intp),
-            scores=np.append(scores, np.minimum([score for score, _ in skipped], scores[-1])).astype(np.float32),
-            compared=self.matches,
-            unread=unread,
-            tried=tried,
-        )
+        slots = np.append(slots, [slot for _, slot in skipped]).astype(np.intp)
+        scores = np.append(scores, np.minimum([score for score, _ in skipped], scores[-1])).astype(np.float32)
+        return Ranking(slots=slots, scores=scores, compared=self.matches, unread=unread, tried=tried)
 
     def _weigh_by_scan(self, slot: int, score: float) -> float:
         return score * (1 + float(self._scan[slot])) / 2 if self._query.technique.spec.scan_counts else score

@@ -65,13 +65,8 @@ def make_tag(
     position = None
     if lat_deg is not None and lon_deg is not None and abs(lat_deg) <= 90 and abs(lon_deg) <= 180:
         position = make_position(float(lat_deg), float(lon_deg), alt_m)
-    return GeoTag(
-        position=position,
-        heading_deg=None if heading_deg is None else heading_deg % 360,
-        roll_deg=roll_deg,
-        pitch_deg=pitch_deg,
-        height_m=height_m,
-    )
+    heading_deg = None if heading_deg is None else heading_deg % 360
+    return GeoTag(position=position, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
 
 
 def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:

@@ -29,8 +29,7 @@ def read_subtitles(path: Path) -> Record:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror}): pass the .SRT file of the video.") from error
-    track = make_track(path, _read_blocks(text))
-    return Record(kind="subtitles of a video", track=track, is_utc=False)
+    return Record(kind="subtitles of a video", track=make_track(path, _read_blocks(text)), is_utc=False)
 
 
 def _read_blocks(text: str) -> Iterator[tuple[float, GeoTag]]:
