@@ -225,14 +225,9 @@ def adapt_model(model: Model, kind: str, results: Iterable[QueryResult], made_of
     if not right.all():  # a fit needs wrong matches too
         weights = np.array([_LEFT_OUT_WEIGHT if result.way == LEFT_OUT else 1.0 for result, _ in usable])
         of_place = fit_logistic(of_place, rows, right, weights, *_PRIOR_PRECISIONS[kind])
-    return Model(
-        of_map=model.of_map,
-        of_place=of_place,
-        scale=model.adapted_scale or model.scale,
-        made=date.today().isoformat(),
-        made_of=made_of,
-        matches=model.matches,
-    )
+    scale = model.adapted_scale or model.scale
+    made = date.today().isoformat()
+    return Model(of_map=model.of_map, of_place=of_place, scale=scale, made=made, made_of=made_of, matches=model.matches)
 
 
 def fit_logistic(

@@ -222,9 +222,8 @@ class Orthophoto:
         width, height = high[0] - low[0], high[1] - low[1]
         shape, window = (height // shrink, width // shrink), Window(*low, width, height)
         try:
-            bands = self._data.read(
-                self._bands, window=window, out_shape=(len(self._bands), *shape), resampling=Resampling.average
-            )
+            out_shape = (len(self._bands), *shape)
+            bands = self._data.read(self._bands, window=window, out_shape=out_shape, resampling=Resampling.average)
             if self._is_alpha_mask:
                 valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
             else:

@@ -91,12 +91,9 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
         finally:
             logging.disable(logging.NOTSET)
         show_progress("")
+        lines = list(read_log(replay_log)) if replay_log else []
         return ReplayResult(
-            flown=flown,
-            lines=list(read_log(replay_log)) if replay_log else [],
-            packets=playback.packets,
-            why_ended=why_ended,
-            guessed=playback.guessed,
+            flown=flown, lines=lines, packets=playback.packets, why_ended=why_ended, guessed=playback.guessed
         )
 
 

@@ -227,8 +227,7 @@ class CoHog:
 
     def match_rotated(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
         """See `Technique.match_rotated`."""
-        ratio = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0)
-        first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
+        first = HEIGHT_RATIOS.index(find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0)) * ROTATIONS
         offset_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - (match.rotation_deg or 0.0)))
         return self.match(query, fine, (first + np.flatnonzero(offset_deg >= tuning.MIN_ROTATED_DEG)).tolist())
 

@@ -61,12 +61,9 @@ def find_displacement(indices: Ints, nearest: Ints, sides: tuple[int, int], weig
     is_near[peak_y : peak_y + size, peak_x : peak_x + size] = True
     is_matched = np.zeros(sides[1] ** 2, bool)
     is_matched[nearest[is_near.ravel().take(shifts)]] = True
-    return FineMatch(
-        count / len(indices),
-        shift_cells=(peak_x - zero_index + mean_x, peak_y - zero_index + mean_y),
-        covariance_cells2=covariance,
-        coverage=np.count_nonzero(is_matched) / len(is_matched),
-    )
+    shift_cells = (peak_x - zero_index + mean_x, peak_y - zero_index + mean_y)
+    coverage = np.count_nonzero(is_matched) / len(is_matched)
+    return FineMatch(count / len(indices), shift_cells=shift_cells, covariance_cells2=covariance, coverage=coverage)
 
 
 def compute_vote_fraction(indices: Ints, nearest: Ints, sides: tuple[int, int], weights: tuple[float, ...]) -> float:

@@ -30,8 +30,7 @@ def compute_filled_bins(grey: Bytes) -> Singles:
     padded = cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
     entropy = np.empty(grey.shape, np.float32)
     for top in range(0, len(grey), _STRIP_ROWS):
-        distinct_count = _count_distinct(padded[top : top + _STRIP_ROWS + 2 * r])
-        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[distinct_count]
+        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[_count_distinct(padded[top : top + _STRIP_ROWS + 2 * r])]
     return entropy
 
 
@@ -113,8 +112,7 @@ def _compute_shannon_map(small: Array) -> Singles:
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
         one_hot = (padded == present[start : start + _STRIP_INTENSITIES]).view(np.uint8)
-        counts = _combine_over_disc(one_hot, np.add)
-        sums += _COUNT_LOG2.take(counts).sum(axis=0)
+        sums += _COUNT_LOG2.take(_combine_over_disc(one_hot, np.add)).sum(axis=0)
     in_disc = _combine_over_disc((padded >= 0).view(np.uint8), np.add)
     # -sum p log2 p with p = c/n is log2 n - (sum c log2 c)/n.
     entropy: Singles = (_COUNT_LOG2[in_disc] - sums) / in_disc / 8

@@ -197,8 +197,7 @@ def make_gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
     radius = np.sqrt(-2 * np.log(uniform[:pairs]))
     angle = 2 * np.pi * uniform[pairs:]
     row = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])[:size]
-    signs = np.where(raw[2 * pairs :] >> np.uint64(63), np.float32(1), np.float32(-1))
-    return row, signs
+    return row, np.where(raw[2 * pairs :] >> np.uint64(63), np.float32(1), np.float32(-1))
 
 
 def _split_cells(length: int, count: int) -> list[tuple[int, int]]:

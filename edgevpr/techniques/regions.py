@@ -44,12 +44,9 @@ class RegionTechnique(VectorTechnique):
         `good` bool (N,), True for each real region. Pixels where `mask` is False are set to the mean of the others."""
         vector, regions = self._describe(self._backbone.run(image, mask))
         good: Array = np.any(regions, axis=1)
+        quality = float(self._quality(good))
         return Descriptor(
-            coarse=vector.astype("<f2"),
-            fine=to_bytes(regions),
-            regions=regions,
-            good=good,
-            quality=float(self._quality(good)),
+            coarse=vector.astype("<f2"), fine=to_bytes(regions), regions=regions, good=good, quality=quality
         )
 
     def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:

@@ -37,11 +37,9 @@ class SeqSlam:
                 "multiples of patch (at least 2 pixels), at most 512."
             )
         self._size, self._patch, self._grid = (width, height), patch, (height // patch, width // patch)
+        parameters: dict[str, int | float | str] = {"width": width, "height": height, "patch": patch}
         self.spec = TechniqueSpec(
-            name="seqslam",
-            parameters={"width": width, "height": height, "patch": patch},
-            coarse=PartSpec((width * height,), "|u1"),
-            sequence=_SEQUENCE_QUERIES,
+            name="seqslam", parameters=parameters, coarse=PartSpec((width * height,), "|u1"), sequence=_SEQUENCE_QUERIES
         )
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:

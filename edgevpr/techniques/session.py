@@ -48,8 +48,7 @@ class Backbone:
         """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where `mask`, bool (H, W), is False
         are set to the mean of the others. Raises ModelError for NaN, values beyond 1e12, or only zeros."""
         card, name = self.card, getattr(self.card.outputs, self.output)
-        prepared = prepare_input(fill_masked(image, mask), card.input)
-        (result,) = run_outputs(card, self.session, [name], prepared)
+        (result,) = run_outputs(card, self.session, [name], prepare_input(fill_masked(image, mask), card.input))
         rank, shape_text = _OUTPUT_SHAPES[self.output]
         if result.ndim != rank or len(result) != 1 or not result.size:
             raise ModelError(

@@ -61,13 +61,9 @@ class VectorTechnique:
             "8bit": PartSpec((length + _SUFFIX_BYTES,), "|i1"),
             "1bit": PartSpec((-(-length // _WORD_BITS) * _WORD_BITS // 8,), "|u1"),
         }
+        coarse = PartSpec((length,), "<f2")
         self.spec = TechniqueSpec(
-            name=name,
-            parameters=parameters,
-            coarse=PartSpec((length,), "<f2"),
-            model_sha256=model_sha256,
-            packed=packed[form],
-            form=form,
+            name=name, parameters=parameters, coarse=coarse, model_sha256=model_sha256, packed=packed[form], form=form
         )
 
     def make_vector(self, image: Image, mask: Mask | None) -> Singles:

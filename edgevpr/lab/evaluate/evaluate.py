@@ -328,8 +328,7 @@ def measure(
             except (ModelError, ImageError) as error:  # the other rows continue
                 outcome.failed[name, label] = error
             else:
-                result = summarise(technique, dataset, answers, options, not_done)
-                results.append(replace(result, technique=label))
+                results.append(replace(summarise(technique, dataset, answers, options, not_done), technique=label))
                 outcome.answers[name, label] = answers
         outcome.measured[name] = metrics.add_pcu(results)
     return outcome

@@ -53,13 +53,9 @@ def plan_mapping_flight(seed: int) -> GeneratedFlight:
             position = {"east_m": east + dx_m, "north_m": north_m + dy_m, "height_m": _HEIGHT_M + dz_m}
             heading_deg = (90 if eastwards else 270) + yaw_deg
             poses.append(CameraPose(**position, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg))
-    return GeneratedFlight(
-        poses=tuple(poses),
-        light=Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12),
-        camera=Camera(),
-        start_utc=datetime(2026, 2, 14, 0, 30, tzinfo=timezone.utc),
-        seed=seed,
-    )
+    light = Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12)
+    start_utc = datetime(2026, 2, 14, 0, 30, tzinfo=timezone.utc)
+    return GeneratedFlight(poses=tuple(poses), light=light, camera=Camera(), start_utc=start_utc, seed=seed)
 
 
 def plan_later_flight(seed: int) -> GeneratedFlight:
@@ -149,5 +145,4 @@ def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
 def make_oscillation(rng: np.random.Generator, count: int) -> Doubles:
     """Make a slow random oscillation between -1 and 1, float64 (count,)."""
     t = np.arange(count)[:, None] / 9
-    waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))
-    return waves @ (0.75, 0.25)
+    return np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2))) @ (0.75, 0.25)

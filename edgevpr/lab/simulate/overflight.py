@@ -103,8 +103,7 @@ def photograph_ground(
     cv2.fillConvexPoly(view, corners_px.round().astype(np.int32), 1)
     if valid[view > 0].mean() < 1 - MAX_WITHOUT_DATA:
         return None
-    centred_pose = replace(pose, east_m=half_m, north_m=half_m)
-    return photograph(ground, metres_per_pixel, centred_pose, camera, light, rng)
+    return photograph(ground, metres_per_pixel, replace(pose, east_m=half_m, north_m=half_m), camera, light, rng)
 
 
 def write_overflight(

@@ -77,8 +77,7 @@ def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, which another version
     of edgevpr may use, and ValueError or ArithmeticError for figures that result in no confidence."""
     known = MAP_FIGURES.get(kind, ()) + PLACE_FIGURES.get(kind, ())
-    names = {*model.of_map.names, *model.of_place.names}
-    if unknown := names.difference(known):
+    if unknown := {*model.of_map.names, *model.of_place.names}.difference(known):
         raise ValueError(f"unknown evidence {min(unknown)!r:.40} for kind {kind!r:.40}")
     for value in (-1.0, 0.0, 1.0):
         model.confidence(dict.fromkeys(known, value))

@@ -273,9 +273,8 @@ class Decider:
                 agreement = verifier.compare_best(ranking)
         if is_plausible:
             with step("locate"):
-                places = load_candidates(
-                    ranking, index, self.place_map, first=MAX_PLACES_CHECKED if spec.looks_down else 1
-                )
+                first = MAX_PLACES_CHECKED if spec.looks_down else 1
+                places = load_candidates(ranking, index, self.place_map, first=first)
                 located = locate(places, spec.cells, query.view, agreement, self.relief.height_sd)
                 if located is None and best.place.position:
                     accuracy_m = max(self.accuracy_m, measure_distance_m(places, spec.cells))

@@ -169,13 +169,9 @@ class PlaceFilter:
             position = move_position(geometry.origin, *posterior.position.tolist())
             covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
+        lost, mass = posterior.lost, posterior.mass
         return TrackEstimate(
-            slot=slot,
-            confidence=confidence,
-            predicted=predicted,
-            lost=posterior.lost,
-            mass=posterior.mass,
-            estimate=estimate,
+            slot=slot, confidence=confidence, predicted=predicted, lost=lost, mass=mass, estimate=estimate
         )
 
     def update_without_match(self, index: PlaceIndex) -> None:

@@ -80,14 +80,13 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     if nothing was accepted), costs. Present if known: view (how the picture maps to the ground), salience, odometry,
     landmarks, confidence, evidence, track (of the place filter).
     """
-    evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
     optional: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.salience and event.salience.scores.rounded(),
         "odometry": event.odometry and event.odometry.fields(),
         "landmarks": event.agreement and _landmark_fields(event.agreement),
         "confidence": event.confidence if exact else _round(event.confidence, 6),
-        "evidence": evidence,
+        "evidence": event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()},
         "track": event.track and _track_fields(event.track),
     }
     return {

@@ -102,8 +102,7 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
     elif reading.kind is VehicleKind.PLANE:
         yield _report_channel(choice)
     else:
-        vision_control = reading.parameters.get(VISION_CONTROL) or None
-        figures = {"parameter": VISION_CONTROL, "value": vision_control}
+        figures = {"parameter": VISION_CONTROL, "value": reading.parameters.get(VISION_CONTROL) or None}
         change = f"{VISION_CONTROL}={POSITION_BIT}"
         yield report_fault("channel", FindingCode.NOT_CARRIED, change, vehicle=reading.vehicle, **figures)
     yield from _check_parameters(PX4_TABLE, choice, reading)
