@@ -6,8 +6,7 @@ everything else in the package may change from version to version.
     edgevpr.build("valley.gpkg", "photos/", camera="nadir")
     with edgevpr.Map("valley.gpkg") as valley:
         match = valley.match(cv2.imread("later.jpg"), heading_deg=90)
-    print(match.position, match.accuracy_m, match.reason)
-"""
+    print(match.position, match.accuracy_m, match.reason)"""
 
 import logging
 import math
@@ -47,8 +46,7 @@ class Match:
     aircraft, if accepted. `accuracy_m`: its standard deviation in metres. `covariance_m2`: (variance east, covariance,
     variance north). `of_place`: `position` is simply that of the place, because the offset from it is unknown.
     `heading_deg`: compass direction of the top of the image. `rotation_deg`: rotation of the image relative to the
-    place's image, clockwise. `t_query_s`: processing time in seconds.
-    """
+    place's image, clockwise. `t_query_s`: processing time in seconds."""
 
     accepted: bool
     reason: Reason
@@ -83,8 +81,7 @@ class Map:
     `config`: flight configuration file (None: the defaults). `fov_deg`: field of view across the longest side of the
     images; if given, they are levelled and scaled by attitude and height. `accept_precision`: confidence that a match
     must reach. `follow`: the images are those of one flight, in order. Raises EdgevprError for a map that cannot be
-    used. Not thread-safe.
-    """
+    used. Not thread-safe."""
 
     def __init__(
         self,
@@ -140,8 +137,7 @@ class Map:
         `fov_deg` or a `lens` in the configuration. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: assumed position;
         places within 300 m are searched, and a few others in case it is wrong. `t_s`: capture time, seconds on any
         clock (None: now); used only with `follow`. Raises ImageError for an image that cannot be used, UsageError for
-        a missing height or an invalid value.
-        """
+        a missing height or an invalid value."""
         if not self._is_open:
             raise UsageError("The map is closed: match within its `with` block, or before close().")
         _check_image(image)
@@ -205,8 +201,7 @@ def build(
     `images`: a folder of images or a video, `FlightPictures` to specify more, or `OrthophotoGrid` for an orthophoto.
     `camera`: "nadir" or "forward". `technique`: name (None: cohog). `config`: flight configuration file
     (None: the defaults). Images that cannot be used are left out with a warning; so is a refinement or
-    calibration that is not possible. Raises EdgevprError.
-    """
+    calibration that is not possible. Raises EdgevprError."""
     source = images if isinstance(images, FlightPictures | OrthophotoGrid) else FlightPictures(source=_to_path(images))
     plan = MapPlan(
         path=_to_path(path), pictures=source, technique=technique, parameters={}, refine=refine, calibrate=calibrate

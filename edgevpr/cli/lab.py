@@ -1,8 +1,7 @@
 """Commands for researchers: `edgevpr eval` measures techniques on data sets with ground truth, `edgevpr simulate`
 writes the images of a simulated flight, and `edgevpr demo` shows all steps from map to match.
 
-In the code of `eval`, a set is a data set, and a row of the printed tables is one technique with its settings.
-"""
+In the code of `eval`, a set is a data set, and a row of the printed tables is one technique with its settings."""
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path

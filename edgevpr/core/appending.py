@@ -2,8 +2,7 @@
 
 Renamed files are called NAME-0001.jsonl, NAME-0002.jsonl, ... in the folder of NAME.jsonl ("numbered files" below). A
 new number is one above the highest, so numbers give the order even if the aircraft's clock is wrong. Symbolic links are
-followed: the numbered files are in the folder of the link's target.
-"""
+followed: the numbered files are in the folder of the link's target."""
 
 import errno
 import fcntl

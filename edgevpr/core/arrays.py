@@ -3,8 +3,7 @@
 `Floats` is float32 or float64, for functions that work with both. `Singles` and `Doubles` are used where the width is
 part of a format or a memory budget.
 
-An array whose dtype is known only at run time, such as a part of a descriptor, is an `Array`.
-"""
+An array whose dtype is known only at run time, such as a part of a descriptor, is an `Array`."""
 
 from typing import Any, TypeAlias
 

@@ -1,7 +1,6 @@
 """The configuration of all commands, and `build`, which makes checked frozen dataclasses from YAML mappings.
 
-An unknown key, a wrong type or a value out of range raises ConfigError with a one-sentence message.
-"""
+An unknown key, a wrong type or a value out of range raises ConfigError with a one-sentence message."""
 
 import os
 import re
@@ -256,8 +255,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     """Build the frozen dataclass `cls` from a mapping. `where` and `prefix` are for messages: the file, and the start
     of each key.
 
-    Raises ConfigError for an unknown or missing key, and for a value of the wrong type or out of range.
-    """
+    Raises ConfigError for an unknown or missing key, and for a value of the wrong type or out of range."""
     hints = typing.get_type_hints(cls)
     specs = {spec.name: spec for spec in fields(cls)}
     for key in mapping:

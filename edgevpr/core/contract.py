@@ -48,8 +48,7 @@ class TechniqueSpec:
     `looks_down`: images show the ground below the camera, so shifts can be converted to metres.
     `height_ratios`: camera heights, relative to that of the map, at which a query can be recognised.
     `max_matches`: maximum number of candidates compared by `match`. If there are more, those with the best
-    `Technique.score_quickly` estimates are chosen. None: all candidates are compared by `match`.
-    """
+    `Technique.score_quickly` estimates are chosen. None: all candidates are compared by `match`."""
 
     name: str
     parameters: dict[str, int | float | str]
@@ -79,8 +78,7 @@ class Descriptor:
     `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read only
     for candidates (None: the technique has none). `quality`: usable fraction of the image, 0..1.
     For queries of techniques that need it: `regions`, the descriptors of its regions; `good`, bool, True for regions to
-    compare; `picture`, which is encoded again at other rotations.
-    """
+    compare; `picture`, which is encoded again at other rotations."""
 
     coarse: np.ndarray
     fine: np.ndarray | None = None
@@ -108,8 +106,7 @@ class Support:
     `back`: fraction (0..1) of the place's regions whose most similar region in the query is at this displacement.
     `likeness`: mean cosine similarity of each region of the query to the most similar region anywhere in the place.
     `log_rank`: for each region of the query, the place's regions are ranked by similarity to it; this is the mean
-    natural logarithm of the rank (from 1) of the region at this displacement.
-    """
+    natural logarithm of the rank (from 1) of the region at this displacement."""
 
     back: float
     likeness: float

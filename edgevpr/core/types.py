@@ -30,8 +30,7 @@ class Pose:
     `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
     `covariance_m2`: covariance (variance east, covariance, variance north) of the place's position, the centre of the
     image. `is_surveyed`: the image was cut from an orthophoto, so the pose needs no refinement. `recorded`: the
-    place's position before refinement (None: refinement did not move it).
-    """
+    place's position before refinement (None: refinement did not move it)."""
 
     up_deg: float
     footprint_m: float
@@ -117,8 +116,7 @@ class Frame:
     its standard deviation; `delay_sd_s`: standard deviation of a further delay that the timestamps of such a camera
     usually hide. `t_utc_s`: seconds since 1970. `heading_deg`: 0..360 clockwise from true north.
     `roll_deg`, `pitch_deg`: attitude of the airframe, positive for right wing down and for nose up; for a camera on a
-    gimbal, its deviation from straight down. `height_m`: above ground.
-    """
+    gimbal, its deviation from straight down. `height_m`: above ground."""
 
     image: np.ndarray
     name: str
@@ -236,8 +234,7 @@ class QueryCost:
 
     `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU seconds of both. `rss_mb`: current
     resident memory of the process. `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not
-    have been drawn without the query.
-    """
+    have been drawn without the query."""
 
     t_encode_s: float = 0.0
     t_match_s: float = 0.0

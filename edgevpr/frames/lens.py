@@ -2,8 +2,7 @@
 
 An *undistorted* image is the one that a lens without distortion would take from the same place, along the same axis.
 Its longest side has the field of view of the calibrated lens (at most `_MAX_UNDISTORTED_FOV_DEG`), so results computed
-from a field of view hold for it. A *ray* is a direction from the lens, given by its tangents to the right and down.
-"""
+from a field of view hold for it. A *ray* is a direction from the lens, given by its tangents to the right and down."""
 
 import math
 import re

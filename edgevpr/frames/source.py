@@ -178,8 +178,7 @@ def open_source(
     monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
     that is replayed at its original times, the result of `read_intervals`. `upright`: rotate single images
     by their EXIF data (see `read_image`); not for a camera that looks straight down, where it shows no direction.
-    Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
-    """
+    Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions."""
     path = Path(uri)
     if positions and is_live(uri):
         raise UsageError(f"{positions} is a position table for recordings, but {uri} is live: omit the table.")

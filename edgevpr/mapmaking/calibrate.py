@@ -10,8 +10,7 @@ in three ways:
   It is used only for the figures reported for the map.
 The results show how similar the places of this map look. So the fit adjusts the part of the *shipped* (default) model
 that decides which place it is (`Model.of_place`), and only as far as the results demand. The part that decides whether
-the query shows mapped ground is not changed: pictures of other ground agree by chance about equally in every map.
-"""
+the query shows mapped ground is not changed: pictures of other ground agree by chance about equally in every map."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -127,8 +126,7 @@ def calibrate(
     map.
     A map of fewer than MIN_PLACES keeps the default models: its results are too few to fit them. Raises UsageError if
     the technique has no confidence model, the map has too few places (looking down), or too few of their pictures are
-    found. Raises MapError if the map file cannot be read or written.
-    """
+    found. Raises MapError if the map file cannot be read or written."""
 
     def require(condition: object, problem: str) -> None:
         if not condition:
@@ -242,8 +240,7 @@ def fit_logistic(
     float (N,), are the weights of the rows.
 
     Gaussian priors keep the regression near `start`: variance 1 / `precision` for its scaled coefficients, and
-    1 / `bias_precision` for its bias (0: the bias is free). With few rows, the result stays close to `start`.
-    """
+    1 / `bias_precision` for its bias (0: the bias is free). With few rows, the result stays close to `start`."""
     scales, features = np.array(start.scales), make_evidence_matrix(rows, start.names) / np.array(start.scales)
     prior_mean = np.append(np.array(start.weights) * scales, start.bias)
     precisions = np.append(np.full(len(scales), precision), bias_precision)

@@ -2,8 +2,7 @@
 
 A tilted camera shows ground far from the aircraft, in its viewing direction, so a place needs the heading. Neighbouring
 images are levelled with the known tilt; the same ground then moves between them by a rotation and a shift. The heading
-is the course over ground between the two positions minus the direction of the shift.
-"""
+is the course over ground between the two positions minus the direction of the shift."""
 
 import math
 from collections.abc import Iterable, Iterator

@@ -2,8 +2,7 @@
 
 A map for a forward camera stores, for each place, the place elsewhere that looks most like it (see
 `evidence.LookAlikes`); to find it, each picture of the map is compared with the places elsewhere. With a camera that
-looks down, landmarks distinguish similar places in flight, so look-alikes are only listed on the page of a map.
-"""
+looks down, landmarks distinguish similar places in flight, so look-alikes are only listed on the page of a map."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from copy import copy

@@ -2,8 +2,7 @@
 
 With salience criteria (`FrameEncoder.gate`), only frames that reach all thresholds become places. To avoid long gaps
 (thesis 3.4.8), the other frames wait. After `max_frames` frames or `max_gap_m` metres without a place, all thresholds
-are lowered in steps of 0.03 until some waiting frames pass; these become low-quality places.
-"""
+are lowered in steps of 0.03 until some waiting frames pass; these become low-quality places."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -146,8 +145,7 @@ def build_map(
     Frames are encoded in the same steps as queries. A frame is in the map already if a place has the same name and
     nearly the same descriptor; the name alone is not enough, because cameras restart their numbering. If a frame cannot
     be encoded, `on_error` is called with the error; with `on_error` None, ModelError is raised. Pictures cut from an
-    orthophoto (surveyed ones) are skipped if they have too little texture to be recognised.
-    """
+    orthophoto (surveyed ones) are skipped if they have too little texture to be recognised."""
     place_map.require_technique(encoder.technique.spec)
     selector = selector or PlaceSelector()
     ids_by_image = place_map.select_ids("source_image")

@@ -1,6 +1,5 @@
 """Moves a map to match GPS, by the offset and scale measured in a flight (see `runtime.flight.survey`, which writes
-lines of kind "survey" to the flight log). The command `edgevpr map move` calls it.
-"""
+lines of kind "survey" to the flight log). The command `edgevpr map move` calls it."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -3,8 +3,7 @@ aircraft: that of a camera whose tilt or late trigger is not recorded.
 
 Refinement places the images by their overlap. Recorded positions that are all ahead of their images then lie on
 opposite sides of them in lines flown in opposite directions, and look like scatter. In a map flown in one direction the
-offset cannot be seen.
-"""
+offset cannot be seen."""
 
 from collections.abc import Iterator
 

@@ -1,8 +1,7 @@
 """Cuts square pictures of the ground out of an orthophoto, with sides in metres and true north up.
 
 rasterio (GDAL and PROJ) reads the file. Other modules import `transform` from here, because this module raises a clear
-error if rasterio is missing.
-"""
+error if rasterio is missing."""
 
 import logging
 import math
@@ -181,8 +180,7 @@ class Orthophoto:
         """Cut out a square of ground around `centre`, true north up, with sides of `footprint_m`.
 
         Returns the picture, uint8 (side_px, side_px, 3) BGR, and bool (side_px, side_px), True where there is data.
-        Pixels without data get the mean colour of the others. Raises ImageError if this part of the file is damaged.
-        """
+        Pixels without data get the mean colour of the others. Raises ImageError if this part of the file is damaged."""
         half_m = footprint_m / 2
         corners = self._to_pixels(centre, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
         if not np.isfinite(corners).all():
@@ -217,8 +215,7 @@ class Orthophoto:
         the result is the mean of `shrink` x `shrink` pixels. The window's sides must be multiples of `shrink`.
 
         Returns the picture, uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError if the
-        window is damaged.
-        """
+        window is damaged."""
         width, height = high[0] - low[0], high[1] - low[1]
         shape, window = (height // shrink, width // shrink), Window(*low, width, height)
         try:

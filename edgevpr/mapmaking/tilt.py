@@ -2,8 +2,7 @@
 
 Over flat ground, all image points of a level camera move equally between images, apart from a rotation and a scale.
 With a tilted camera, near ground moves farther than distant ground: the relative change of the motion across the image
-is tan(tilt) / focal length.
-"""
+is tan(tilt) / focal length."""
 
 import math
 from collections.abc import Iterable

@@ -65,8 +65,7 @@ def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> Chann
     `parameters`: the values by name, without parameters that the autopilot lacks.
 
     A plane without GPS dead-reckons for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
-    Without GPS and optical flow, a copter lands within seconds and a rover stops, even if they receive single fixes.
-    """
+    Without GPS and optical flow, a copter lands within seconds and a rover stops, even if they receive single fixes."""
     for number in range(len(RECEIVERS)):
         name = resolve_name(parameters, RECEIVERS[number])
         if parameters.get(name) == MAVLINK_GPS:

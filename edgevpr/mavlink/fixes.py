@@ -2,8 +2,7 @@
 
 A fix is never sent late, and after five consecutive unanswered fixes only occasional ones are sent. COMMAND_ACK does
 not identify the fix that it answers, so it is matched to the oldest fix sent less than a second ago. With one fix a
-second, and answers within tens of milliseconds, there is only one such fix. An answer without a fix is only counted.
-"""
+second, and answers within tens of milliseconds, there is only one such fix. An answer without a fix is only counted."""
 
 import logging
 import math

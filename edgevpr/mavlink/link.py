@@ -57,8 +57,7 @@ class Link:
     is used only inside `turns`. `drive` makes the driver, which moves packets through the port.
 
     All methods except `start` and `close` may be called from any thread; they never wait for the other end, and never
-    raise. Methods without a docstring are those of `Conversation`.
-    """
+    raise. Methods without a docstring are those of `Conversation`."""
 
     def __init__(
         self, address: LinkAddress, settings: LinkSettings, turns: Turns | None = None, drive: DriverMaker = PortDriver

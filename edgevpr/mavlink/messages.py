@@ -1,8 +1,7 @@
 """Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
 
 `t_mono_s` is a time of the system's monotonic clock in seconds. `stamp_s` is such a time by the receiver's clock:
-ArduPilot keeps a single timestamp correction for all messages of a link, which a restart of our clock would corrupt.
-"""
+ArduPilot keeps a single timestamp correction for all messages of a link, which a restart of our clock would corrupt."""
 
 import math
 from collections.abc import Mapping, Sequence

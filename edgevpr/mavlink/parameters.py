@@ -2,8 +2,7 @@
 affects our messages, its correct values, and the effect of wrong ones.
 
 The rules are in `ardupilot_parameters` and `px4_parameters`. They are used by the flight, which sends nothing while a
-parameter is unanswered or dangerous, by `edgevpr doctor`, and by the page docs/reference/parameters.md.
-"""
+parameter is unanswered or dangerous, by `edgevpr doctor`, and by the page docs/reference/parameters.md."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -1,8 +1,7 @@
 """The GPS receivers of an autopilot, from their own messages: GPS_RAW_INT and GPS2_RAW.
 
 These messages cannot contain our own positions, except those of the receiver that edgevpr simulates (GPS_INPUT), which
-is excluded. The autopilot's estimate, in contrast, may be derived from our positions.
-"""
+is excluded. The autopilot's estimate, in contrast, may be derived from our positions."""
 
 import math
 from dataclasses import dataclass, replace

@@ -2,8 +2,7 @@
 back, neither within a flight nor between flights. Used by the link and by `edgevpr check` and `doctor`.
 
 pymavlink signs sent messages. Its check of received messages is not used: it stores the timestamp of a message before
-it compares the signature, so a single forged message with a timestamp far in the future would block all valid ones.
-"""
+it compares the signature, so a single forged message with a timestamp far in the future would block all valid ones."""
 
 import hashlib
 import hmac

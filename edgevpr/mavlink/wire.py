@@ -1,8 +1,7 @@
 """The only import of pymavlink: its dialect and rotations, and the parser from bytes to messages.
 
 `ardupilotmega` has all messages that ArduPilot and PX4 exchange with a companion computer; the dialect `all` would need
-another 1 MB of RAM. `mavutil` is not imported: it would need another 20 MB, and its connections hang, spin or raise.
-"""
+another 1 MB of RAM. `mavutil` is not imported: it would need another 20 MB, and its connections hang, spin or raise."""
 
 import math
 import struct

@@ -26,8 +26,7 @@ class MapConnection:
     """A connection to a map file. Create it with `create`, `open` or `open_for_writing`, and close it or use `with`.
 
     `stored` holds the values of the table edgevpr_map (see `mapspec`), and `spec` describes the technique that made the
-    descriptors. `db` is the current SQLite connection: `require_unchanged` may replace it.
-    """
+    descriptors. `db` is the current SQLite connection: `require_unchanged` may replace it."""
 
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
         self.path, self.stored = path, read_stored(path, db)

@@ -1,7 +1,6 @@
 """The index: the part of a map that is held in RAM, in arrays that are allocated once, within a memory budget.
 
-`load_index` makes it, and `retrieve` searches it.
-"""
+`load_index` makes it, and `retrieve` searches it."""
 
 import logging
 import math

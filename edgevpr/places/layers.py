@@ -1,8 +1,7 @@
 """Layers of a map: groups of places that were cut from an orthophoto at the same footprint. Most maps have one layer.
 
 A picture matches best among places that show slightly less ground, in finer detail. So if a flight is higher or lower
-than planned, a map with several footprints recognises more of its pictures.
-"""
+than planned, a map with several footprints recognises more of its pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

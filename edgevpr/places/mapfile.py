@@ -2,8 +2,7 @@
 
 `PlaceMap.add` returns only after a place is committed, so a power failure while mapping loses at most the place that
 was being written, and never the file. All values read are checked (see `rows`): a place that cannot be read is left
-out, and the others are used. The base class `MapConnection` holds the open file.
-"""
+out, and the others are used. The base class `MapConnection` holds the open file."""
 
 import json
 import math
@@ -77,8 +76,7 @@ class PlaceMap(MapConnection):
         place. Raises MapError (disk full, ...).
 
         `salience` and `landmarks` (encoded bytes) are None if there are none. An impossible time or altitude is stored
-        as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes.
-        """
+        as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes."""
         content = rows.make_content(frame, descriptor, self.spec, salience, landmarks)
         with self.transaction():
             self.db.execute("DELETE FROM edgevpr_map WHERE key = 'calibration'")

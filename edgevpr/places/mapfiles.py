@@ -70,8 +70,7 @@ def lock_map(path: Path, make: bool = False) -> int:
 
     Readers need no lock. SQLite's own lock is not enough, because it lasts for only one transaction: two programs that
     map the same pictures would add every place twice. `make` creates a missing file. Raises MapBusyError if another
-    program holds the lock, and MapError if the file cannot be opened.
-    """
+    program holds the lock, and MapError if the file cannot be opened."""
     with translate_errors(path):
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
     try:

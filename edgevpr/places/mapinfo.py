@@ -125,8 +125,7 @@ def read_identity(place_map: PlaceMap) -> dict[str, Any]:
     Raises MapError if the map cannot be read.
 
     Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors precede
-    them in the file, so they are read quickly, and change whenever a descriptor changes.
-    """
+    them in the file, so they are read quickly, and change whenever a descriptor changes."""
     digest, places = hashlib.sha256(), 0
     with translate_errors(place_map.path):
         for row in place_map.db.execute("SELECT key, value FROM edgevpr_map ORDER BY key"):

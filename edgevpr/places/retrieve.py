@@ -6,8 +6,7 @@ that cannot be read is *left out* from then on. Its absence must never cause a w
 * The query that reveals an unreadable place is rejected.
 * A place that was left out keeps its row in the index. A query that may show it (see `Ranking.unread`) is rejected.
 * Without a fine part the row suffices: a place that was left out keeps its rank, and is rejected if it is the best.
-* If most of the places compared with one query cannot be read, the file is at fault, and no place is left out.
-"""
+* If most of the places compared with one query cannot be read, the file is at fault, and no place is left out."""
 
 import math
 from collections.abc import Iterator

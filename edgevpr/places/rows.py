@@ -2,8 +2,7 @@
 
 A row is used only if each value has the right type and range, and each BLOB the right size and checksum. A missing
 checksum (NULL) is accepted, because it is removed when a place is moved on purpose. The exception is the time, which
-other programs write in many formats: a value that is not a time is treated as unknown.
-"""
+other programs write in many formats: a value that is not a time is treated as unknown."""
 
 import math
 import sqlite3

@@ -1,8 +1,7 @@
 """Board profiles: hardware, power, and the resources that edgevpr may use. Each is a YAML file in `profiles/`. This
 module also detects the board that it runs on. The flight, `edgevpr profile` and `edgevpr service` use it.
 
-`root`: root of the file system with /proc and /sys; tests pass another tree.
-"""
+`root`: root of the file system with /proc and /sys; tests pass another tree."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,8 +45,7 @@ class Board:
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
     `threads`: number of threads that a network may use.
     `recognised_by`: text in the model name (device tree or firmware) of a machine that is this board (None:
-    never).
-    """
+    never)."""
 
     name: str
     title: str

@@ -2,8 +2,7 @@
 
 Symbols of the thesis: U, utilisation of the whole machine (0..1); a, idle power; s, power added at full load; P,
 power; t, time; indices e, m and q for encoding, matching and a whole query. Equation 5.3, P_q = P_e + P_m, is omitted:
-encoding and matching run one after the other, so their powers do not add up. Their energies do, as in equation 5.6.
-"""
+encoding and matching run one after the other, so their powers do not add up. Their energies do, as in equation 5.6."""
 
 import re
 from dataclasses import dataclass

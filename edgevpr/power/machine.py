@@ -1,7 +1,6 @@
 """Hardware of this machine and memory of this process, as the kernel reports them in /proc and /sys.
 
-`root`: root of the file system; tests pass another tree. A megabyte (MB) is 10^6 bytes.
-"""
+`root`: root of the file system; tests pass another tree. A megabyte (MB) is 10^6 bytes."""
 
 import os
 import re

@@ -1,7 +1,6 @@
 """Temperature, CPU frequency and supply voltage of the machine, and signs of throttling, for the flight.
 
-Each reading opens some files in /sys.
-"""
+Each reading opens some files in /sys."""
 
 import re
 from collections.abc import Iterator

@@ -142,8 +142,7 @@ class Playback(Tape):
 
     Code that has changed since the flight may read more, less, or in another order. A read that has no value on the
     tape before the next frame returns the newest value of its kind, which keeps code and tape synchronised. `guessed`
-    counts the reads out of order; if it is 0, the replay read exactly what the flight read.
-    """
+    counts the reads out of order; if it is 0, the replay read exactly what the flight read."""
 
     def __init__(self, notes: Iterable[Note]) -> None:
         self.perform_turn: Callable[[float, list[Note]], None] | None = None

@@ -1,8 +1,7 @@
 """Registry of the place-recognition techniques: their names, their parameters, and a function that creates one.
 
 Map building, flights and evaluations create every technique here, and its module is imported only then. "The thesis" is
-Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. A card is a YAML file that describes a network.
-"""
+Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. A card is a YAML file that describes a network."""
 
 import inspect
 from collections.abc import Callable

@@ -6,8 +6,7 @@ the thesis the score is the mean of their cosines (`matching: thesis`). Here, by
 a displacement of the image. docs/explanation/how-cohog-matches.md explains every step of the score.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
-places that are compared in full (see `placecode` and, for a nadir camera, which looks straight down, `layout`).
-"""
+places that are compared in full (see `placecode` and, for a nadir camera, which looks straight down, `layout`)."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace

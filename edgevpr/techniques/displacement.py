@@ -35,8 +35,7 @@ def find_displacement(indices: Ints, nearest: Ints, sides: tuple[int, int], weig
     query's grid and of the reference's, both even or both odd. A shift is measured between the centres of the grids.
 
     A vote that is n cells from a shift, along rows or columns, has the weight `weights[n]`; votes further away have
-    none. The peak is the shift with the largest sum. The score is its fraction of all votes, 0 without any region.
-    """
+    none. The peak is the shift with the largest sum. The score is its fraction of all votes, 0 without any region."""
     if not len(indices):
         return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)
     border = len(weights) - 1

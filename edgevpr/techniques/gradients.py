@@ -1,8 +1,7 @@
 """Histograms of oriented gradients over cells and blocks, and the low-frequency ("slow") patterns of blocks.
 
 A map made on one processor may be used on another, so results must be rounded identically on all of them: products,
-sums and roots are computed one by one. The rounding of OpenCV's fused operations and matrix products differs.
-"""
+sums and roots are computed one by one. The rounding of OpenCV's fused operations and matrix products differs."""
 
 from functools import lru_cache
 

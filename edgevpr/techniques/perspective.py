@@ -3,8 +3,7 @@
 If two cameras look straight down on flat ground, a rotation, a scale and a shift map one picture to the other. If one
 camera is tilted, a homography is needed (Hartley and Zisserman 2004, section 13.1): the scale changes across the
 picture. At first, only regions near the shift of the match agree. Each round fits a homography to the regions that
-agree with the previous one, so that more of the picture is included.
-"""
+agree with the previous one, so that more of the picture is included."""
 
 import numpy as np
 

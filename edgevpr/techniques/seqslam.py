@@ -2,8 +2,7 @@
 2012, "SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights").
 
 This module computes the difference of one image from every place and enhances the local contrast. `places.sequence`
-searches for trajectories; this technique uses it by default.
-"""
+searches for trajectories; this technique uses it by default."""
 
 import math
 

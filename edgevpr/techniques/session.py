@@ -29,8 +29,7 @@ class Backbone:
 
     Raises ModelError, with a message of one sentence, if onnxruntime or the card's file is missing, if the file does
     not match the card or is not ONNX, if an input or output has the wrong shape or an axis without a size, or if the
-    check yields non-finite values or only zeros. Raises UsageError unless `threads` is 1 to 256.
-    """
+    check yields non-finite values or only zeros. Raises UsageError unless `threads` is 1 to 256."""
 
     def __init__(self, card: Card, output: str, threads: int = 1) -> None:
         if getattr(card.outputs, output) is None:

@@ -5,8 +5,7 @@ published data sets by their files:
 * query/, ref/ and ground_truth.csv: edgevpr's own layout.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, in UTM metres (Pitts30k,
   GSV-Cities and others in that form). References near the query are correct.
-* query/ and ref/ with positions (positions.csv or EXIF): references near the query are correct.
-"""
+* query/ and ref/ with positions (positions.csv or EXIF): references near the query are correct."""
 
 import csv
 import hashlib
@@ -62,8 +61,7 @@ class Dataset:
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
     """Read a data set and check it against its folders. Query images missing from `ground_truth` are not scored.
 
-    Raises UsageError with file, name and remedy, and SourceError for a folder without images.
-    """
+    Raises UsageError with file, name and remedy, and SourceError for a folder without images."""
     return make_dataset(query_dir, ref_dir, read_truth(ground_truth), ground_truth)
 
 

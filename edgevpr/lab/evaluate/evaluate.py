@@ -2,8 +2,7 @@
 up the answers.
 
 Numbers in parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Place Recognition for
-Autonomous Robots*).
-"""
+Autonomous Robots*)."""
 
 import math
 import tempfile
@@ -75,8 +74,7 @@ class QueryAnswer:
     `accepted`: a flight would have accepted the match. `accepted_wrong`: accepted, and wrong. `accepted_off_map`:
     accepted, and the query's place is not in the map. `accepted_elsewhere`: accepted, wrong, and not a neighbour of a
     correct or ignored reference (`outside_neighbourhood`). `discarded`: the salience gate discarded the query as not
-    memorable. `encoding` and `matching` are the costs of the two stages.
-    """
+    memorable. `encoding` and `matching` are the costs of the two stages."""
 
     query: str
     has_match: bool

@@ -5,8 +5,7 @@ every query.
 from 0, of its first correct reference, infinite if there is none. `has_match`, bool (N,), is True if its place is in
 the map. A match is accepted if its score reaches the threshold. Each threshold gives one point of the precision-recall
 curve: precision is the fraction of accepted matches that are correct, recall the fraction of correct matches that are
-accepted. Numbers like (2.1) are equations of the thesis.
-"""
+accepted. Numbers like (2.1) are equations of the thesis."""
 
 import math
 from collections.abc import Iterable
@@ -61,8 +60,7 @@ class TechniqueResult(Figures):
     the charge drawn from the battery pack for all queries, in Ah (5.7); `ah_assumes` states board, pack and efficiency.
     `sequence`: number of queries matched together. `known`: see `evaluate.MatchOptions`. `weights`: origin of the
     network's weights (None: no network). `not_done`: sentences on steps of `map build` that failed for this map.
-    `pcu`: set by `add_pcu`, because it depends on all techniques compared.
-    """
+    `pcu`: set by `add_pcu`, because it depends on all techniques compared."""
 
     technique: str
     references: int

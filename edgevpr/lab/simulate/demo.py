@@ -54,8 +54,7 @@ def run_demo(folder: str | Path) -> str:
     """Generate both flights, map the first, fly the second without a flight controller, and return the results as text.
 
     Writes to `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
-    Raises EdgevprError if a command fails.
-    """
+    Raises EdgevprError if a command fails."""
     folder = Path(folder)
     map_path, log_path, picture_path = (folder / name for name in ("map.gpkg", "flight.jsonl", "demo.png"))
     first, second = folder / "flight-1", folder / "flight-2"

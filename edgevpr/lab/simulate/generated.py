@@ -109,8 +109,7 @@ def write_shots(folder: Path, shots: Iterable[tuple[GeoTag, Image | None]], qual
     """Write `folder`/images/*.jpg, and finally `folder`/positions.csv with the true position and attitude of each
     image. A shot is a tag and a picture, uint8 (H, W, 3) BGR; shots without a picture are skipped.
 
-    Yields the name of each image once it is written. Raises OSError if the folder cannot be written.
-    """
+    Yields the name of each image once it is written. Raises OSError if the folder cannot be written."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     written: dict[str, GeoTag] = {}
     for number, (tag, picture) in enumerate(shots):

@@ -1,8 +1,7 @@
 """Generates farmland seen from above, from a seed, as a substitute for a real site; `camera` photographs it.
 
 The land is divided into fields along bent lines (points are (N, 2): east, north in metres). Each field is painted as
-one kind, such as meadow; then a river, a road, farms and trees, (N, 4) metres: east, north, radius, top.
-"""
+one kind, such as meadow; then a river, a road, farms and trees, (N, 4) metres: east, north, radius, top."""
 
 from collections.abc import Callable, Iterable
 

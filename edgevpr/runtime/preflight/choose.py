@@ -4,8 +4,7 @@ The accuracy of each technique, for a downward or forward camera, was measured o
 figures (accuracy.json) are installed with the program, so that every cost can be shown with its accuracy.
 
 An option is a technique in one form. The most accurate option that fits the board is recommended. A technique that
-accepted a wrong place on the image sets is never recommended, because its fixes would be sent.
-"""
+accepted a wrong place on the image sets is never recommended, because its fixes would be sent."""
 
 import json
 import math
@@ -31,8 +30,7 @@ class Accuracy:
 
     The other fields are numbers of queries. `asked`: all queries of all image sets, including those used for tuning.
     `accepted`: the best place was accepted. `accepted_wrong`: it was accepted, but wrong. `accepted_elsewhere`: it was
-    accepted, but wrong and not even a neighbour of the correct place.
-    """
+    accepted, but wrong and not even a neighbour of the correct place."""
 
     recall_at_1: float
     sets: int
@@ -78,8 +76,7 @@ class Option:
     `t_query_s`: wall seconds per query. `cpu_s`: CPU-seconds per query, summed over all cores. `map_ram_mb`,
     `map_disk_mb`: size of the map's index in RAM, and of the map file. `process_ram_mb`: RAM of the process with the
     index. `reachable_hz`: maximum queries per second. `misfit`: reason why it does not fit, to follow a name
-    (None: it fits).
-    """
+    (None: it fits)."""
 
     label: str
     name: str
@@ -113,8 +110,7 @@ def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, plan
     `costs`: costs on `board`.
 
     A query must end before the next one begins, and before its fix is too old to send. Queries may use the
-    fraction `cpu_share` of all cores.
-    """
+    fraction `cpu_share` of all cores."""
     map_ram_mb = costs.ram_bytes_per_place * plan.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
     query = costs.encode + costs.match(plan.places)
@@ -148,8 +144,7 @@ def find_accuracy(label: str, camera: str | None, candidates: int | None = None)
     """Return the accuracy of `label` (technique and form, see `techniques.format_name`); None if it was not measured.
 
     `camera`: "nadir" or "forward" (None: forward). `candidates`: number of places compared with a query, if fewer than
-    the technique's default (None: the default).
-    """
+    the technique's default (None: the default)."""
     name = label if candidates is None else f"{label}, {candidates} candidates"
     figures = _read_accuracies()[camera or "forward"].get(name)
     return Accuracy(**figures) if figures else None

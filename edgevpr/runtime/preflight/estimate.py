@@ -2,8 +2,7 @@
 on a board. They are measured if the board is this machine. On another ARM board, the times of `cohog` are computed from
 instruction counts; the costs of other techniques, and on other boards, are known only on the board itself.
 
-`dataclasses.asdict` of a FlightEstimate can be written as JSON.
-"""
+`dataclasses.asdict` of a FlightEstimate can be written as JSON."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -30,8 +29,7 @@ class TechniqueEstimate:
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
     `flight_mah`: charge that the board draws during the flight. `flight_marginal_mah`: the part that the queries add to
     an idle board (equation 5.7). `flight_pack_frac`: `flight_mah` as a fraction of the pack's capacity, which is also
-    the fraction of its endurance that the aircraft loses. All charges are drawn from the pack.
-    """
+    the fraction of its endurance that the aircraft loses. All charges are drawn from the pack."""
 
     option: Option
     query: QueryCost
@@ -48,8 +46,7 @@ class FlightEstimate:
     `techniques`: those whose costs on the board are known. `unknown`: labels of the others. `recommended`: label of the
     recommended option (None: no option is suitable). `reason`: sentence that explains the recommendation, or why there
     is none. `notes`: remarks on the estimate. `unusable`: the reason for each technique that cannot be used on this
-    machine.
-    """
+    machine."""
 
     board: str
     title: str

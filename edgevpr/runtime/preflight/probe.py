@@ -47,8 +47,7 @@ class TechniqueCosts:
     after all places of the map are scanned in RAM (None: the technique has one stage, and compares all places).
     `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a query for the scan.
     `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`). `process_mb`: peak
-    resident memory of the process without a map. `sequence`: number of queries matched together.
-    """
+    resident memory of the process without a map. `sequence`: number of queries matched together."""
 
     encode: StageCost
     match_per_place: StageCost
@@ -88,8 +87,7 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
     then with a large index.
 
     Each image is matched repeatedly for about `repeat_s` seconds per map, and the least CPU time is used, because time
-    spent in other programs is not a cost of the technique. Raises ModelError if the technique fails on an image.
-    """
+    spent in other programs is not a cost of the technique. Raises ModelError if the technique fails on an image."""
     bench = _Bench(technique, meter or QueryMeter(load_board("this")), repeat_s)
     spec, candidates = technique.spec, technique.candidates
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:

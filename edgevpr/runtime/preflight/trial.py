@@ -31,8 +31,7 @@ class Trial:
 
     A finished trial has `costs` or `problem`, a sentence that explains why this machine cannot run the technique.
     `parameters`: all parameters of the technique in the trial. `weights`: name of its network's weights (None: no
-    network).
-    """
+    network)."""
 
     label: str
     name: str

@@ -7,8 +7,7 @@ scale), then the second (the shift) is added.
 
 Two landmarks match if each is the most similar to the other (mutual nearest neighbours). Each pair of the best
 matches defines a similarity, and the one that fits the most matches is used. Nothing is random: the same images give
-the same result.
-"""
+the same result."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any

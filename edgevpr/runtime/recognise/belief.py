@@ -12,8 +12,7 @@ without history, the result is that of the query alone. Three rules limit the in
   the ground below it (`anchor`), and the next query there replaces it. In a hover only the newest query counts.
 * Ground outside the map that was mistaken for a place may also resemble the next places. So a place that fits the
   history raises the odds of being on the map only by a limited factor, and a history predicts a place only if it
-  includes a match that was certain by itself (`confirmed`).
-"""
+  includes a match that was certain by itself (`confirmed`)."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -164,8 +163,7 @@ class Belief:
         * one hypothesis for each candidate,
         * the likelihood of the query if lost, relative to that on ground that never resembles the map,
         * the fraction (0..1) of the weight that comes from pictures of the same ground as the previous query,
-        * the factor, at most 1, by which the odds of not being lost shrink if this query is weaker evidence there.
-        """
+        * the factor, at most 1, by which the odds of not being lost shrink if this query is weaker evidence there."""
         scale, position, cov = self._scale, proposed.position, proposed.covariance
         p_none = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.probability.sum()))
         ratio = np.log(np.maximum(proposed.probability, MIN_DIVISOR) * places / p_none)

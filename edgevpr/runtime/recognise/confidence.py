@@ -7,8 +7,7 @@ its logistic regression. Both come with edgevpr, and are adapted to a map that i
 The distribution of the logits of wrong matches was measured on many sites: the highest follow an exponential
 distribution (peaks over threshold: Pickands 1975). The *chance* of a match is the probability that a wrong match has
 logits at least as high, summed over both errors. For a precision p, matches with a chance of at most 1 - p are
-accepted. The confidence is a logistic function of the logarithm of the chance (Platt 1999).
-"""
+accepted. The confidence is a logistic function of the logarithm of the chance (Platt 1999)."""
 
 import json
 import math

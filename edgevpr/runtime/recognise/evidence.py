@@ -16,8 +16,7 @@ match, except `rank_gap`.
 * twin: agreement of the place with the place of the map that looks most like it (see `LookAlike`), minus the agreement
   of pictures of its own ground; if it is 0 or more, the two are *twins* (ahead). No model uses `twin` or `apart`
 * apart: `agree` minus the agreement of these two places with each other (ahead, in a map of single views)
-* tried: `Ranking.tried`, which is not an input of a regression (see `Model.chance`)
-"""
+* tried: `Ranking.tried`, which is not an input of a regression (see `Model.chance`)"""
 
 import math
 from collections.abc import Collection, Mapping
@@ -184,8 +183,7 @@ def gather_evidence(
 
     If the camera `looks_down`, `agreement` is that of the landmarks (None: not compared), and places with the numbers
     `same_ground` show the same ground as the best one, so they do not count as elsewhere. `look_alikes` are those of
-    the map (None: unknown).
-    """
+    the map (None: unknown)."""
     matches = {slot: ranking.compared[slot] for slot in ranking.compared_slots}
     support = {slot: match.support for slot, match in matches.items() if match.support}
     if not matches or (not looks_down and len(support) < len(matches)):

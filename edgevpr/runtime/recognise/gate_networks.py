@@ -8,8 +8,7 @@ Each family of detectors has a decoder here. Its arguments are the outputs in th
 (height, width) in pixels, and it returns
 
 * `boxes`, float32 (N, 4): left, top, right, bottom as fractions of the input; they may extend beyond it,
-* `scores`, float32 (N, C): the score of each class, 0..1.
-"""
+* `scores`, float32 (N, C): the score of each class, 0..1."""
 
 from collections.abc import Callable, Sequence
 
@@ -44,8 +43,7 @@ class Memorability:
     def compute_matrix(self, image: Image) -> Singles:
         """Compute the memorability of each crop of uint8 (H, W[, 3]): float32 (5, 5) in 0..1, the M of thesis 3.2.1.
 
-        Raises ModelError for numbers that are not finite, or are outside 0..1.
-        """
+        Raises ModelError for numbers that are not finite, or are outside 0..1."""
         name, crops = self._output, prepare_crops(image, self.card.input)
         batches = [crops] if self._has_batches else np.split(crops, len(crops))
         results = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]

@@ -2,8 +2,7 @@
 
 In flight, finding a place never depends on hints alone: a compass may be wrong, and GPS may be spoofed. So a query that
 is not accepted with hints is followed by one without (`Prior`). Recorded queries are evaluated one by one, each with
-its own known data (`RecordedPrior`).
-"""
+its own known data (`RecordedPrior`)."""
 
 import math
 import statistics
@@ -155,8 +154,7 @@ class Prior(RecordedPrior):
     of the last match (None: unknown, or computed from its height); the height ratio is relative to it.
     `searches_heights`: also search at other heights if a query is not accepted. `max_speed_m_s` is that of the aircraft
     (None: positions are not hints), `heading_within_deg` the largest error of a known heading (None: nor are headings).
-    `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
-    """
+    `is_live` is False for recorded frames, for which the autopilot's reports do not apply."""
 
     def __init__(self, max_speed_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         super().__init__((), heading_within_deg)
@@ -173,8 +171,7 @@ class Prior(RecordedPrior):
         `vehicle` is the autopilot's last report. The radius of the area (`reach`) is the farthest that the aircraft can
         have flown plus `margin_m`. Its centre is the autopilot's position if that has GPS (without GPS it drifts, and
         our own fix is better), or else our last fix if at most a minute old. If no maximum speed is set, the area is
-        around the position from the place filter, if that is certain.
-        """
+        around the position from the place filter, if that is certain."""
         if not self._is_live or (vehicle and not vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
         start, reach = self._last_fix, None
@@ -213,8 +210,7 @@ class Prior(RecordedPrior):
         """Store position and height of an accepted match; the next query uses the hints that agree with it. Until
         there is one, queries with and without hints alternate. The query's picture was enlarged by `scale`, so at its
         height it shows `footprint_m` of ground (None: the height is unknown). `layers` are those of the map (None: it
-        has one).
-        """
+        has one)."""
         # Outside the map, only every second query is searched at all heights, because this takes twice as long.
         self.searches_heights = accepted or not self.searches_heights
         if self._all_hints is None:

@@ -1,8 +1,7 @@
 """Decides whether to accept a match. Only this module does, and a match that is not accepted has no position.
 
 A place *elsewhere* is outside the neighbourhood of the best place (see `outside_neighbourhood`). The *lead* of
-the best place is its score minus that of the best place elsewhere.
-"""
+the best place is its score minus that of the best place elsewhere."""
 
 import math
 from collections.abc import Mapping
@@ -118,8 +117,7 @@ class AcceptRule:
     * `min_quality`: the least quality of the query's picture
     * `confidence_rule`: the confidence that is also required (None: score and lead alone decide)
     * `min_verify_score`: the least score to compare landmarks and, with a `confidence_rule`, to accept a match
-    * `look_alikes`: places of the map that look alike (None: unknown)
-    """
+    * `look_alikes`: places of the map that look alike (None: unknown)"""
 
     min_score: float
     min_margin: float
@@ -140,8 +138,7 @@ class Findings:
     flight so far, `predicted` before this query (None: the query is judged alone). `lead_over_other_rotation`: the
     lead, as in the evidence, over the same place with the picture at another rotation (None: not compared).
     `unshifted_fraction`: the fraction of a few places elsewhere that are unshifted, if the best one is too (else 0).
-    `tilt`: tilt of the query relative to the place (None: not measured).
-    """
+    `tilt`: tilt of the query relative to the place (None: not measured)."""
 
     ranking: Ranking = field(kw_only=False)
     agreement: Agreement | None = None

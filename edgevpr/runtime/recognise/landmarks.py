@@ -1,8 +1,7 @@
 """Landmarks of an image: points that can be found again in other images of the same ground, described by 256 bits.
 
 The points are FAST corners and the bits are ORB descriptors (Rublee et al. 2011). A place keeps few of them, spread
-over the image. A query has more, so that most of the place's visible points are among them.
-"""
+over the image. A query has more, so that most of the place's visible points are among them."""
 
 import struct
 from dataclasses import dataclass
@@ -37,8 +36,7 @@ class Landmarks:
 
     `points` float32 (K, 2): x to the right and y down from the centre, as fractions of the longest side, so that images
     of different sizes are comparable. `angle_deg` float32 (K,): direction, clockwise from the right. `size` float32
-    (K,): width of the described patch, as a fraction of the longest side. `bits` uint8 (K, 32): the descriptor.
-    """
+    (K,): width of the described patch, as a fraction of the longest side. `bits` uint8 (K, 32): the descriptor."""
 
     points: Singles
     angle_deg: Singles

@@ -1,6 +1,5 @@
 """Levelling: removes lens distortion, and warps the image of a camera that looks straight down as if the aircraft
-flew level. A wrong height gives a wrong scale; a technique with `height_ratios` still recognises the image.
-"""
+flew level. A wrong height gives a wrong scale; a technique with `height_ratios` still recognises the image."""
 
 import logging
 import math
@@ -48,8 +47,7 @@ class Levelling:
 
     With `below`, for places, the point below the camera becomes the centre. `is_on_gimbal`: a gimbal keeps the camera
     level, unless the frame itself has other angles. `is_live` is False for recorded frames, for which the autopilot's
-    reports do not apply.
-    """
+    reports do not apply."""
 
     lens: Lens | None = field(kw_only=False)
     below: bool = False

@@ -2,8 +2,7 @@
 
 A match gives the shift between the centres of the pictures of query and place. If the `Pose` of the place is known (how
 its picture maps to the ground), the shift gives a position. Places that show the same ground must give about
-the same position, and their mean is more accurate. Without a pose, as ahead, the position is that of the place.
-"""
+the same position, and their mean is more accurate. Without a pose, as ahead, the position is that of the place."""
 
 import cmath
 import math
@@ -148,8 +147,7 @@ def locate(
 
     Of the places that show the same ground, those whose positions agree with the first are listed in the result. The
     first five of these with at least half of the best score determine the position. Places with such a score and a
-    position far from the first contradict it; if the sum of their scores is too large, the position is not trusted.
-    """
+    position far from the first contradict it; if the sum of their scores is too large, the position is not trusted."""
     best, pose, nadir, error = places[0].place, places[0].place.pose, view.nadir_offset or (0.0, 0.0), None
     first = _estimate_position(places[0], best, cells, nadir)
     if first is None or best.position is None or pose is None:

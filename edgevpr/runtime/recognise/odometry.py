@@ -1,8 +1,7 @@
 """Visual odometry: the motion of the aircraft between two frames, from the landmarks of both pictures.
 
 Both pictures are levelled, so a rotation, a scaling and a shift map the landmarks of one to those of the other, and the
-point below the camera is known in each. No map is needed. It works only for cameras that look straight down.
-"""
+point below the camera is known in each. No map is needed. It works only for cameras that look straight down."""
 
 import math
 from dataclasses import dataclass

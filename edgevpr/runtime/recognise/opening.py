@@ -48,8 +48,7 @@ def open_recogniser(
     With `uses_hints`, for a flight, hints narrow each query (see `hints`); otherwise only the `known` data of recorded
     queries do (see `RecordedPrior`). With `tracks_flight`, the queries are those of one flight, in order (see
     `place_filter`). `meter` measures the queries (None: use the clocks of this computer). Raises an EdgevprError
-    that explains the mismatch, such as a setting that the map was not built with.
-    """
+    that explains the mismatch, such as a setting that the map was not built with."""
     if config.map is None:
         raise UsageError("There is no map to recognise places in: set one with --map, or `map:` in the configuration.")
     source, match = config.source, config.match
@@ -129,8 +128,7 @@ def create_technique(
     """Make the technique that a map was built with, for `board`.
 
     Raises MapError if `name` or `settings` belong to another technique, UsageError for a setting that it lacks, and
-    ModelError for an unusable network.
-    """
+    ModelError for an unusable network."""
     built_with, settings, threads = place_map.spec, settings or {}, board.threads if board else None
     if not techniques.is_known(built_with.name):
         raise MapError(

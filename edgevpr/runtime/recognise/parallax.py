@@ -2,8 +2,7 @@
 
 A step over ground that lies a third lower looks a quarter shorter. But in view, a landmark keeps its depth below the
 camera: between two pictures it shifts by the camera's motion divided by this depth. If the landmarks below the camera
-shifted less than others in the last step, and as much as they do in this one, the ground here is lower.
-"""
+shifted less than others in the last step, and as much as they do in this one, the ground here is lower."""
 
 import math
 from dataclasses import dataclass

@@ -3,8 +3,7 @@
 A picture is levelled with the reported attitude. If that is wrong, the picture remains tilted by the error, and one
 rotation, scaling and shift cannot align its landmarks with those of the place: a tilt moves a landmark by a term that
 grows with the square of its distance from the point below the camera. This term is fitted here. The constant term is
-indistinguishable from a shift: it is the effect of a wrong attitude on the position.
-"""
+indistinguishable from a shift: it is the effect of a wrong attitude on the position."""
 
 import cmath
 import logging
@@ -179,8 +178,7 @@ def fit_attitude_error(query: Array, place: Array, view: View, up_deg: float) ->
     """Fit the attitude error to landmarks; None if there are too few, or the view has no attitude or focal length.
 
     `query` and `place`, complex (n,), are their landmarks that agree, as in `agreement`. `up_deg` is
-    the compass direction of the top of the query's levelled picture.
-    """
+    the compass direction of the top of the query's levelled picture."""
     count = len(query)
     if count < _MIN_LANDMARKS or view.nadir_offset is None or view.focal is None:
         return None

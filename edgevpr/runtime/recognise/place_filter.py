@@ -1,8 +1,7 @@
 """Tracks a flight over the places of a map: converts the result of each query to proposals for a `belief`.
 
 The best place of a *search pass*, one search of the map for one query, has a confidence. The remaining probability that
-the query shows ground of the map is distributed over the other places compared.
-"""
+the query shows ground of the map is distributed over the other places compared."""
 
 import copy
 import math
@@ -101,8 +100,7 @@ class PlaceFilter:
     to keep the belief of the last pass.
 
     `max_speed_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for recorded frames, whose
-    times are those of the recording.
-    """
+    times are those of the recording."""
 
     def __init__(self, place_map: PlaceMap, *, max_speed_m_s: float | None, is_live: bool) -> None:
         self._map, self._max_speed_m_s, self._is_live = place_map, max_speed_m_s or DEFAULT_MAX_SPEED_M_S, is_live

@@ -2,8 +2,7 @@
 
 Flights, `match`, `eval` and the probe use it. It has no link, flight log, thread or clock: the result
 depends only on the arguments. A *search pass* is one search of the map for the query of a frame. A query may
-take several, at different heights.
-"""
+take several, at different heights."""
 
 import logging
 import math
@@ -40,8 +39,7 @@ class Recogniser:
 
     `odometry` measures the motion between frames (None: not measured). `prior` makes hints that narrow each query
     (None: the whole map is searched). `place_filter` tracks the flight from query to query (None: each is judged
-    alone). Between two frames, `change` sets candidates and mount for the next.
-    """
+    alone). Between two frames, `change` sets candidates and mount for the next."""
 
     def __init__(
         self,
@@ -98,8 +96,7 @@ class Recogniser:
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Recognise one frame; `vehicle` is the autopilot's report at that moment (None: no report).
 
-        Never raises an Exception: an error in a frame, a place or the technique becomes a rejection with its reason.
-        """
+        Never raises an Exception: an error in a frame, a place or the technique becomes a rejection with its reason."""
         self.meter.begin()
         query = odometry_step = decision = failure = None
         try:

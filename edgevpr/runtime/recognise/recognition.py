@@ -22,8 +22,7 @@ _BEST_FIELDS = ("place", "reference_image", "score", "position", "shift_cells", 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
     """Result of one frame. A field is None if its stage was not reached.
-    `fix` reports how the position was sent (None: the event was not yet passed to the channel to the autopilot).
-    """
+    `fix` reports how the position was sent (None: the event was not yet passed to the channel to the autopilot)."""
 
     frame: Frame | None
     vehicle: Vehicle | None = None  # the autopilot's report when the frame was taken
@@ -78,8 +77,7 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     Always present: query, place (number), reference_image, score, position (of the place), shift, covariance, rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
     if nothing was accepted), costs. Present if known: view (how the picture maps to the ground), salience, odometry,
-    landmarks, confidence, evidence, track (of the place filter).
-    """
+    landmarks, confidence, evidence, track (of the place filter)."""
     optional: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.salience and event.salience.scores.rounded(),

@@ -5,8 +5,7 @@ still worth keeping. So a frame lacks entropy only if it has less than the thres
 (the thesis has a constant threshold). The usual entropy is computed from the upper half of the previous frames,
 since a long stretch of sky or water changes only the lower half. Until there are enough, half the threshold applies.
 
-If none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
-"""
+If none of 20 frames passes, all thresholds are lowered (thesis 3.4.8)."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -47,8 +46,7 @@ class SalienceGate:
     """Judges the frames of a flight in order.
 
     `memorability` and `detector` are None if their criterion is off. The detector runs on every k-th frame only (k =
-    `detect_every` of the configuration), and its result is used until the next.
-    """
+    `detect_every` of the configuration), and its result is used until the next."""
 
     def __init__(
         self, config: SalienceConfig, memorability: Memorability | None = None, detector: Detector | None = None
@@ -107,8 +105,7 @@ def compute_scores(image: Image, memorability: Memorability | None = None, is_st
     """Return the scores of an image, uint8 (H, W[, 3]): means over a copy with a longer side of at most 320 pixels.
     Pixels that are not static count as 0 in the other two scores, because an image with many of them is less useful.
 
-    `is_static`, bool (H, W), is the detector's result for the image (None: no detector). Raises ModelError.
-    """
+    `is_static`, bool (H, W), is the detector's result for the image (None: no detector). Raises ModelError."""
     shrink, grey = _MAX_PX / max(image.shape[:2]), image
     if shrink < 1:
         size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])

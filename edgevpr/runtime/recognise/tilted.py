@@ -1,8 +1,7 @@
 """Measures the perspective of a query over its place a second time, from the image warped onto the place.
 
 If an image is strongly tilted, few regions agree, because each is seen from a different side. After the image is
-warped by their homography, more regions agree and give the tilt more accurately. One more image must be encoded.
-"""
+warped by their homography, more regions agree and give the tilt more accurately. One more image must be encoded."""
 
 import math
 

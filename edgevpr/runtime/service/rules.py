@@ -2,8 +2,7 @@
 will choose, and if not, which parameters to change.
 
 The rules are based on the sources of ArduPilot 4.7-dev and PX4 1.17-alpha. The channels were flown without GPS in
-simulation, those of PX4 with 1.17.0 and 1.18-beta1.
-"""
+simulation, those of PX4 with 1.17.0 and 1.18-beta1."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
