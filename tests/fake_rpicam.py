@@ -2,8 +2,7 @@
 of --output, and sends it MJPEG until the reader goes or it is told to end.
 
 With --list-cameras it lists one. FAKE_RPICAM in the environment: `absent` ends at once as without a camera, or lists
-none; `hangs` sends a few pictures and then none; `slow` takes seconds to the first.
-"""
+none; `hangs` sends a few pictures and then none; `slow` takes seconds to the first."""
 
 import argparse
 import os

@@ -1,7 +1,6 @@
 """Stand-ins for time, a source of frames and a flight controller's link, for tests of what lies above them.
 
-Each keeps the promises of the real thing, and `test_fakes.py` holds both to them.
-"""
+Each keeps the promises of the real thing, and `test_fakes.py` holds both to them."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable

@@ -17,8 +17,7 @@ class AnsweringAutopilot:
 
     `messages` are those it can be asked for, `parameters` those it has. It `loses` so many of the first questions of
     each kind; `is_mute` answers nothing at all; `says_unknown` answers for a parameter that it has not (else it is
-    silent, as older firmware is). It signs with its `key`.
-    """
+    silent, as older firmware is). It signs with its `key`."""
 
     def __init__(
         self, to: int, *, parameters=None, messages=(), system_id=1, loses=0, is_mute=False, says_unknown=True,

@@ -1,8 +1,7 @@
 """Real ground stations and routers.
 
 `make test` puts MAVProxy and MAVSDK into the folder `clients` of the virtual environment; EDGEVPR_CLIENTS names
-another.
-"""
+another."""
 
 import os
 import subprocess

@@ -30,8 +30,7 @@ STEP_DEG = 0.001  # of latitude: 111 m
 class Flight:
     """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log but the last, the `end`.
 
-    `settings` are keys of the configuration.
-    """
+    `settings` are keys of the configuration."""
 
     def __init__(self, place_map: Path, log: Path, clock: FakeClock, link: FakeLink | None = None, **settings) -> None:
         self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)

@@ -3,8 +3,7 @@ Used by `controller`.
 
 Times and limits are from the source code: AP_NavEKF3.h (deadReckonDeclare_ms, posRetryTimeNoVel_ms,
 posRetryTimeUseVel_ms, tiltDriftTimeMax_ms), AP_NavEKF3_PosVelFusion.cpp (setLatLng), AP_VisualOdom. The
-behaviour of a copter without GPS was observed in ArduPilot's own simulator.
-"""
+behaviour of a copter without GPS was observed in ArduPilot's own simulator."""
 
 import math
 

@@ -62,8 +62,7 @@ def run_autopilot(
     With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
     information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
     and accepts no fix. `parameters` are set before the start. Raises LinkError if the link cannot be opened, KeyError
-    for an unknown parameter.
-    """
+    for an unknown parameter."""
     controller = FlightController(vehicle, AlongTrack(track) if track else Motion(), gps=gps, start_utc_s=time.time())
     for name, value in parameters.items():
         controller.set(name, value)

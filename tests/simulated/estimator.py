@@ -4,8 +4,7 @@ NavEKF3 and EKF2 estimate position, velocity and attitude together: a position o
 sensors is explained by a tilt too. This is the same Kalman filter for a level vehicle: of each axis the position, the
 velocity and the tilt, with the process noise of NavEKF3 (AP_NavEKF3.cpp). It has no states for the biases of gyros and
 accelerometers, for yaw and for height. Its time constants are 2.5 s by a receiver good to half a metre, and longer by a
-poorer one.
-"""
+poorer one."""
 
 import math
 

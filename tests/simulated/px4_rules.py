@@ -5,8 +5,7 @@ gps_control.cpp, gnss_checks.cpp, aux_global_position.cpp and ev_pos_control.cpp
 compared with it.
 
 GPS and our positions are fused side by side, each within its gate. One that contradicts the estimate resets it only
-where the other is not active: a GPS that comes back while ours is active is refused.
-"""
+where the other is not active: a GPS that comes back while ours is active is refused."""
 
 import math
 from dataclasses import dataclass

@@ -1,7 +1,6 @@
 """A map made on one processor flies on another: descriptors are the same to the last bit.
 
-The expected checksums were the same on x86-64 and on aarch64 (a Cortex-A53).
-"""
+The expected checksums were the same on x86-64 and on aarch64 (a Cortex-A53)."""
 
 import itertools
 import os

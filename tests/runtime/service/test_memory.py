@@ -38,8 +38,7 @@ def big_map(tmp_path_factory):
 def flight(big_map):
     """A whole flight within the limit: (its log, the largest memory figures, files mapped).
 
-    Two cores, as boards have few: every thread of a pool takes address space of its own.
-    """
+    Two cores, as boards have few: every thread of a pool takes address space of its own."""
     if not (shutil.which("prlimit") and shutil.which("taskset")):
         pytest.skip("prlimit and taskset are not on this machine (Debian: apt install util-linux)")
     write_frames(big_map.parent / "frames", FRAMES)
