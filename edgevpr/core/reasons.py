@@ -185,6 +185,7 @@ class ReasonCode(Code):
         "set source.up_deg: {up_deg:.0f}",
     )
     IMAGES_MIRRORED = "images are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
+    STRIP_FOUND = "part of the image never changes", "{width_px:.0f} px at the {edge} never change: crop"
     HEIGHT_DIFFERS = "height differs", "height: autopilot {autopilot_height_m:.0f} m, images {image_height_m:.0f} m"
     HEIGHT_AGREES = "height agrees with images again"
     GPS_DIFFERS = "GPS is far from the map", "GPS is {distance_m:.0f} m from the map's position"

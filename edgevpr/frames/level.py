@@ -78,7 +78,7 @@ class View:
     (east, north), for an image not warped because its lens is unknown, computed from the height `nadir_height_m`.
     `focal`: focal length as a fraction of the longest side. `rotation_deg`: clockwise rotation that was applied to
     the image. `height_scale`: factor by which the height that `footprint_m` was computed from had been corrected.
-    `reason`: why a tilted image was not warped."""
+    `axis_sd`: `nadir_offset_sd` due to a strip. `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -90,6 +90,7 @@ class View:
     focal: float | None = None
     rotation_deg: float = 0.0
     height_scale: float = 1.0
+    axis_sd: float = 0.0
     reason: Reason | None = None
 
     @property

@@ -5,6 +5,8 @@ Coarse copies are compared block by block. The texture of a block determines how
 image moves by 1.5 of their pixels in any direction; a block with a smaller drop has not moved. So no threshold
 depends on the kind of ground or its contrast. Blocks that cannot show every motion, such as furrows, are not used."""
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +14,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Image, Singles
+from edgevpr.core.reasons import Reason, ReasonCode
 
 _SIZE_PX = (128, 96)  # columns and rows of a coarse copy
 _BLOCK_PX = 16
@@ -20,6 +23,14 @@ _MOTION_PX = 1.5
 _MIN_LOSS = 0.05  # of correlation due to that motion; a smaller loss may be compression noise
 _MAX_READ_COLUMNS = 640  # columns that are averaged; a larger image is subsampled first
 _THUMBNAIL_PX = (16, 12)
+# Strips: chosen on 14 image sets without one, and on copies with strips of 2 to 20 %.
+_STRIP_IMAGES = 9
+_MIN_CHANGE_LEVELS = 2.0  # median over an image; one that changes less, as in a hover, is skipped
+_MAX_STATIC_LEVELS = 1.0  # change of a pixel of a strip: at most this, or this share of the image's median
+_MAX_STATIC_RATIO = 0.25
+_MIN_GROUND_RATIO = 0.4  # mean change of a pixel of ground, to the image's median
+_MAX_BAR_DIFFERENCE = 2  # columns of the coarse copy: equal bars on opposite edges shift nothing
+_MIN_FRACTION = 0.6  # of the pixels of a column: digits change, and some ground does not
 BLOCK_COUNT = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
 
 
@@ -65,6 +76,44 @@ class CoarseImage:
         """Return True for each textured block that has not moved in the other image, bool (48,)."""
         loss = 1 - (self.blocks * other.blocks).sum(axis=1)
         return np.asarray(self.is_textured & (loss < self.min_loss))
+
+
+class StripCheck:
+    """Finds a strip along one edge that never changes: its end is straight and stays in place. `report` is called then.
+    `offset`: half of its width as a fraction of the longest side: the shift of the optical axis, masked or not."""
+
+    def __init__(self) -> None:
+        self.report: Callable[[Reason], None] = lambda reason: logging.getLogger(__name__).warning("%s", reason)
+        self.offset = 0.0
+        self._last_offset = 0.0  # in the nine images before
+        self._greys: list[Singles] = []
+
+    def add(self, image: Image) -> None:
+        """Process the next image, uint8 (H, W[, 3])."""
+        grey = make_coarse(image[::2, ::2]).grey.astype(np.float32)
+        if self._greys and np.median(abs(grey - self._greys[-1])[::4, ::4]) < _MIN_CHANGE_LEVELS:
+            return
+        self._greys.append(grey)
+        if len(self._greys) < _STRIP_IMAGES:
+            return
+        changes = abs(np.diff(self._greys, axis=0))
+        self._greys = [grey]
+        mean = changes.mean(axis=0)
+        median = float(np.median(mean[::4, ::4]))
+        is_ground = mean >= _MIN_GROUND_RATIO * median
+        is_static = changes.max(axis=0) <= max(_MAX_STATIC_LEVELS, _MAX_STATIC_RATIO * median)
+        columns = np.zeros(2)  # of the strip at the left minus those at the right, and at the top minus the bottom
+        for axis, step in (0, 1), (0, -1), (1, 1), (1, -1):
+            ground, static = (pixels.mean(axis=axis)[::step] for pixels in (is_ground, is_static))
+            end = int(np.argmax(ground >= _MIN_FRACTION))
+            columns[axis] += step * end * ((static[:end] < _MIN_FRACTION).sum() <= 1)  # one may be partly ground
+        strip_px = np.where(abs(columns) > _MAX_BAR_DIFFERENCE, columns, 0) * image.shape[1::-1] / _SIZE_PX
+        offset = float(np.hypot(*strip_px)) / 2 / max(image.shape)
+        if offset and not self.offset:
+            edge = ("left", "top", "right", "bottom")[int(np.argmax([*strip_px, *-strip_px]))]
+            self.report(Reason(ReasonCode.STRIP_FOUND, {"width_px": float(max(abs(strip_px))), "edge": edge}))
+        self.offset = max(offset, self._last_offset)
+        self._last_offset = offset
 
 
 def make_coarse(image: Image) -> CoarseImage:

@@ -73,6 +73,7 @@ class Flight:
         self._vitals = Vitals(
             parts, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
         )
+        parts.recogniser.encoder.strip.report = lambda note: notifier.report("camera", Severity.WARNING, note)
         gps = GpsWatch(min_accuracy_m, notifier, parts.autopilot)
         self._surveyor = SurveyReporter(notifier, gps, camera, self._set_mount)
         self._observers: tuple[Callable[[Recognition], None], ...] = (

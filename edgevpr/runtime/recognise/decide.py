@@ -47,7 +47,7 @@ from edgevpr.runtime.recognise.locate import (
     locate_at_place,
     measure_distance_m,
 )
-from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt
+from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, CommonTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.relief import Relief
 from edgevpr.runtime.recognise.tilted import measure_again
@@ -279,6 +279,9 @@ class Decider:
                 if located is None and best.place.position:
                     accuracy_m = max(self.accuracy_m, measure_distance_m(places, spec.cells))
                     located = locate_at_place(best.place.position, accuracy_m)
+                if located:  # a strip shifts all fixes, as a tilt does
+                    axis_sd = query.view.axis_sd / (query.view.focal or TYPICAL_FOCAL)
+                    located = add_tilt_covariance(located, 0.0, axis_sd)
         same_ground: Collection[int] = located.places if located else ()
         if agreement and not same_ground:
             with step("verify"):

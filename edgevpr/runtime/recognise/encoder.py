@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
@@ -10,6 +10,7 @@ from edgevpr.core.reasons import NOT_SEARCHED, Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, Mount, View, enlarge_image
 from edgevpr.frames.mask import OverlayMask
+from edgevpr.frames.sameness import StripCheck
 from edgevpr.places.layers import Layers
 from edgevpr.runtime.recognise.landmarks import (
     AHEAD_PX,
@@ -43,12 +44,13 @@ class EncodedFrame:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameEncoder:
     """Levels or undistorts the image of a frame (`levelling`), masks parts of it (`mask`), judges whether it is
-    memorable (`gate`), and encodes it with the `technique`. A step that is None is skipped."""
+    memorable (`gate`), and encodes it with the `technique`. A step that is None is skipped. See `StripCheck`."""
 
     technique: Technique
     levelling: Levelling | Undistortion | None = None
     mask: OverlayMask | None = None
     gate: SalienceGate | None = None
+    strip: StripCheck = field(default_factory=StripCheck)
 
     def prepare(
         self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
@@ -57,7 +59,10 @@ class FrameEncoder:
         mask = self.mask.fit_to(frame.image) if self.mask else None
         if self.levelling is None:
             return enlarge_image(LevelledImage(frame.image, mask, UNKNOWN_VIEW), scale)
-        return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
+        picture = self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
+        if self.technique.spec.looks_down and frame.pose is None:
+            self.strip.add(frame.image)
+        return replace(picture, view=replace(picture.view, axis_sd=self.strip.offset * picture.view.zoom))
 
     def encode(
         self,

@@ -160,7 +160,7 @@ def centre_place(frame: Frame, view: View) -> Frame:
         return replace(frame, position=move_position(frame.position, -east_m, -north_m, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
-    variance_m2, position = GPS_SD_M**2, frame.position
+    variance_m2, position = GPS_SD_M**2 + (view.axis_sd * view.footprint_m) ** 2, frame.position
     if view.nadir_offset is None:
         variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:

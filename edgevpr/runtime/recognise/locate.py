@@ -200,7 +200,8 @@ def add_tilt_covariance(located: Located, single_sd: float, common_sd: float) ->
     tilt_m2 = (max(single_sd, common_sd) * height_m) ** 2
     east_m2, cross_m2, north_m2 = located.covariance_m2
     covariance_m2 = (east_m2 + tilt_m2, cross_m2, north_m2 + tilt_m2)
-    return replace(located, covariance_m2=covariance_m2, tilt_m2=tilt_m2, common_tilt_m=common_sd * height_m)
+    common_tilt_m = math.hypot(located.common_tilt_m, common_sd * height_m)
+    return replace(located, covariance_m2=covariance_m2, tilt_m2=located.tilt_m2 + tilt_m2, common_tilt_m=common_tilt_m)
 
 
 def covariance_matrix(covariance: Covariance) -> Doubles:

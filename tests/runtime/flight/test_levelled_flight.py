@@ -91,6 +91,14 @@ def fixed_survey(monkeypatch):
     monkeypatch.setattr(MapSurvey, "compute_result", lambda self: found)
 
 
+def test_flight_reports_a_strip_of_its_images_once(place_map, tmp_path):
+    images = [np.pad(draw_texture(number, 256, 192), ((0, 0), (0, 24))) for number in range(20)]
+    link = FakeLink(clock := FakeClock())
+    lines = Flight(place_map, tmp_path / "f.jsonl", clock, link, **FAR_APART).fly(FakeSource(images, clock))
+    assert [line["note"]["code"] for line in select(lines, "camera")] == ["STRIP_FOUND"]
+    assert (4, "edgevpr: 24 px at the right never change: crop") in link.texts()
+
+
 @pytest.mark.usefixtures("fixed_survey")
 def test_images_are_levelled_once_the_attitude_is_known(place_map, tmp_path, monkeypatch):
     monkeypatch.setattr(watching, "_SURVEY_INTERVAL", 2)

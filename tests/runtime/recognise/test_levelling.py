@@ -129,6 +129,16 @@ def test_step_locates_the_aircraft_from_a_steep_image_of_known_angles(walk, grou
 
 
 @pytest.mark.slow
+def test_step_claims_half_of_a_strip_that_never_changes(walk, ground):
+    asked, frames = walk(make_scaling()), [frame(ground, number % 4) for number in range(10)]
+    events = [asked.step(replace(seen, image=np.pad(seen.image, ((0, 0), (0, 96), (0, 0))))) for seen in frames]
+    true, located = frames[-1].position, events[-1].located
+    error_m = math.hypot(*offset_m(true.lat_deg, true.lon_deg, located.position.lat_deg, located.position.lon_deg))
+    assert error_m == pytest.approx(FOOTPRINT_M * 48 / 640, abs=2.0)
+    assert min(located.accuracy_m, located.common_tilt_m) > 0.9 * error_m
+
+
+@pytest.mark.slow
 def test_prepare_warps_the_mask_with_the_image(walk, ground):
     seen = frame(ground, 1, heading_deg=180.0)
     image = seen.image.copy()
