@@ -92,6 +92,12 @@ def refine_map(
             "error",
             refined.common_offset_m,
         )
+    if refined.displaced:
+        _log.warning(
+            "the positions of the images from %s to %s are displaced together by %.0f m against all others, as by "
+            "another log or base station: correct them and rebuild the map; until then, all fixes claim this error",
+            *refined.displaced,
+        )
     return refined
 
 

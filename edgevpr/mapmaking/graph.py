@@ -77,16 +77,16 @@ class GraphSolution:
 
 
 @show_elapsed("refining: solving for all positions")
-def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
+def solve_graph(recorded: np.ndarray, ties: Ties, sd_m: float | None = None) -> GraphSolution:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
-    north in metres, for which a common standard deviation is estimated."""
+    north in metres, with a common standard deviation `sd_m` along one axis (None: it is estimated)."""
     count = len(recorded)
     _, component = connected_components(_make_tie_matrix(ties, count), directed=False)
     graph = _Graph(recorded, ties, component)
-    factor, recorded_sd_m = _INITIAL_TIE_FACTOR, _INITIAL_RECORDED_SD_M
-    for _ in range(_MAX_ROUNDS):
-        last_factor, sd_m = factor, recorded_sd_m
-        normal, weights = graph.optimise(sd_m, factor)
+    factor, recorded_sd_m = _INITIAL_TIE_FACTOR, sd_m or _INITIAL_RECORDED_SD_M
+    for _ in range(1 if sd_m else _MAX_ROUNDS):
+        last_factor, last_sd_m = factor, recorded_sd_m
+        normal, weights = graph.optimise(last_sd_m, factor)
         variance = 2 * _invert_diagonal(normal)  # the weights are per axis, the variance is the sum of both axes
         if len(ties):
             # The unknowns absorb part of the residuals: correct the estimate by the fraction of redundant observations.
@@ -97,7 +97,7 @@ def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
         # Add the variance of the solution: with few ties, the solution follows every error of a recorded position.
         total_var_m2 = _estimate_sd(residual_m) ** 2 + np.median(variance[:count]) / 2
         recorded_sd_m = max(_MIN_RECORDED_SD_M, float(np.sqrt(total_var_m2)))
-        if abs(np.log(last_factor / factor)) < _MIN_SD_CHANGE and abs(np.log(sd_m / recorded_sd_m)) < _MIN_SD_CHANGE:
+        if max(abs(np.log(last_factor / factor)), abs(np.log(last_sd_m / recorded_sd_m))) < _MIN_SD_CHANGE:
             break
     return GraphSolution(
         position=graph.position,

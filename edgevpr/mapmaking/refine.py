@@ -31,7 +31,7 @@ from edgevpr.core.text import Progress, decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
-from edgevpr.mapmaking.offset import find_common_offset
+from edgevpr.mapmaking.offset import find_common_offset, find_displaced_run
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import find_inconsistent_tags
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVEN_INLIERS, Overlay, measure_agreement
@@ -41,6 +41,7 @@ from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 MAX_TURN_DEG = 135.0
 _MIN_COMMON_TURN = 0.7  # length of the mean of unit vectors
 _MIN_GROUP = 4  # places connected by ties; three cannot reveal an error in scale
+_LOOSE_SD_M = 300.0  # of recorded positions that do not outweigh ties; with 1000, lines of 100 images bend by 30 m
 _MAX_LOG_SD = 0.15  # maximum standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
 # If the misfit between recorded positions and ties exceeds this fraction of their spread, their mirror images are
 # tried; one is right if its misfit is below this ratio of the original one. Correct sets have 0.01 to 0.36, and their
@@ -93,7 +94,8 @@ class Refinement:
     `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined. Nor was it if
     `turned_deg`, the mean angle (clockwise) from recorded headings to those that the ties show, is large.
     `common_offset_m`: median of the distances from images to recorded positions due to an offset that all have in the
-    same direction from the camera (see `offset`; None: no such offset). It is part of the claimed accuracy."""
+    same direction from the camera (see `offset`; None: none). `displaced`: first and last image of a run whose
+    recorded positions are displaced together, and metres against the others. Both are part of the claimed accuracy."""
 
     places: int
     without_position: int
@@ -108,6 +110,7 @@ class Refinement:
     is_mirrored: bool = False
     turned_deg: float = 0.0
     common_offset_m: float | None = None
+    displaced: tuple[str, str, float] | None = None
 
 
 def refine(
@@ -136,20 +139,23 @@ def refine(
     compare_pair = _make_comparer(place_map, technique, refinable, images)
     pairs = _find_likely_pairs(recorded)
     ties = {pair: tie for pair in progress(pairs, len(pairs), "refining") if (tie := compare_pair(*pair))}
-    solution = solve_graph(recorded, _to_ties(ties))
+    run, displacement_m = find_displaced_run(recorded, solve_graph(recorded, _to_ties(ties), _LOOSE_SD_M))
+    aligned = recorded - displacement_m * (np.isin(np.arange(len(recorded)), run) - len(run) / len(recorded))
+    solution = solve_graph(aligned, _to_ties(ties))
     extra = sorted(set(_find_overlapping_pairs(solution.position, solution.log, _is_determined(solution))) - set(pairs))
     if extra:
         ties |= {pair: tie for pair in progress(extra, len(extra), "refining") if (tie := compare_pair(*pair))}
-        solution = solve_graph(recorded, _to_ties(ties))
-    is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solution)
+        solution = solve_graph(aligned, _to_ties(ties))
+    is_mirrored = _is_mirrored(positions, recorded, aligned, _to_ties(ties), solution)
     refined = _is_determined(solution) & (not is_mirrored)
     turned_deg = _measure_turn(refinable, solution, refined)
     refined &= abs(turned_deg) <= MAX_TURN_DEG
     moved_m, footprint_m = abs(solution.position - recorded)[refined], np.exp(solution.log.real)
     members = np.flatnonzero(refined)
     offset = find_common_offset(recorded[refined], solution.position[refined], solution.log[refined])
+    shift_m = abs(displacement_m) if len(members) and not offset else 0.0  # on two lines, both look the same
     # The offset has the same length in any direction, so each axis gets all of it.
-    position_var_m2 = solution.position_var / 2 + (offset * footprint_m) ** 2
+    position_var_m2 = solution.position_var / 2 + (offset * footprint_m) ** 2 + shift_m**2
     _write_poses(place_map, refinable, positions, solution, position_var_m2, refined)
     return replace(
         result,
@@ -166,6 +172,7 @@ def refine(
         is_mirrored=is_mirrored,
         turned_deg=turned_deg,
         common_offset_m=float(np.median(offset * footprint_m[refined])) if offset else None,
+        displaced=(refinable[run[0]].source_image, refinable[run[-1]].source_image, shift_m) if shift_m else None,
     )
 
 
@@ -176,9 +183,11 @@ def _is_determined(solution: GraphSolution) -> Bools:
     return is_determined
 
 
-def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, solution: GraphSolution) -> bool:
+def _is_mirrored(
+    positions: list[Position], recorded: Complexes, aligned: Complexes, ties: Ties, solution: GraphSolution
+) -> bool:
     """Return True if the ties fit a mirror image of the recorded positions much better than the positions themselves,
-    as when lat and lon are exchanged or a sign is wrong. Places on a straight line or in small groups hide it."""
+    and about as well as `aligned`: lat and lon are exchanged or a sign is wrong. A straight line hides it."""
     sample = slice(_MAX_MIRROR_PLACES)
     misfit = _compute_misfit(recorded, solution, sample)
     if misfit < _MIN_MISFIT:
@@ -190,7 +199,7 @@ def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, sol
     if abs(lon_deg).max() < 90:  # exchanging lat and lon also changes the proportions of the track
         east_m, north_m = project_to_metres(lon_deg, lat_deg)
         mirrored.append(east_m + 1j * north_m)
-    limit = _MAX_MIRRORED_RATIO * misfit
+    limit = min(_MAX_MIRRORED_RATIO * misfit, _compute_misfit(aligned, solution, sample) / _MAX_MIRRORED_RATIO)
     return any(_compute_misfit(image, solve_graph(image, sample_ties), sample) < limit for image in mirrored)
 
 

@@ -201,6 +201,34 @@ def test_refine_reports_and_claims_an_offset_in_the_direction_of_the_camera(flow
     assert refined["position_sd_m"] == pytest.approx(20, abs=5)
 
 
+@pytest.mark.parametrize("displacement_m", [40, 150])
+def test_refine_reports_and_claims_that_half_of_the_positions_are_displaced(
+    flown_dir, map_path, capsys, caplog, displacement_m
+):
+    _, poses = flown_dir
+    with PlaceMap.open_for_writing(map_path) as place_map, place_map.transaction():
+        for number, place in enumerate(list(place_map.read_places())):
+            if 7 <= number < 21:
+                place_map.move_place(place.place_id, move_position(place.position, displacement_m, 0.0), None)
+    refined = run_json(capsys, "map", "refine", map_path)
+    first, last, shift_m = refined["displaced"]
+    assert (first, last) == ("007.jpg", "020.jpg")
+    assert shift_m == pytest.approx(displacement_m, rel=0.2)
+    assert refined["position_sd_m"] == pytest.approx(shift_m, rel=0.1)
+    assert "007.jpg to 020.jpg are displaced" in caplog.text
+    with PlaceMap.open(map_path) as place_map:
+        off_m, _ = measure_errors_m(place_map, poses)
+        claimed_m = [place.pose.covariance_m2[0] ** 0.5 for place in place_map.read_places()]
+    assert (off_m < claimed_m).all()
+
+
+def test_refine_claims_no_displacement_of_a_map_without_one(map_path, capsys, monkeypatch):
+    refined = run_json(capsys, "map", "refine", map_path)
+    assert refined["displaced"] is None
+    monkeypatch.setattr("edgevpr.mapmaking.refine.find_displaced_run", lambda recorded, solution: (range(0), 0j))
+    assert run_json(capsys, "map", "refine", map_path)["position_sd_m"] == refined["position_sd_m"]
+
+
 @pytest.mark.data
 def test_refine_ties_images_by_votes_without_landmarks(tmp_path):
     folder = _DATA / "aerial_garfield28"
