@@ -28,7 +28,6 @@ _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 # After so many such steps in a row, none is used until a fix or GPS: a less certain state would agree after 15 s.
 _MAX_CONTRADICTIONS = 3
-_MIN_STEP_SIGMA = 3.0
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # random change of that error in one second
 # Its heading then drifts too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
@@ -194,14 +193,16 @@ class DriftFilter:
         self._p[_SCALE] *= ratio
         self._p[:, _SCALE] *= ratio
         self._p[_SCALE, _SCALE] += (ratio * step.log_height_sd) ** 2
-        (east_m, north_m), matrix, transition = step.moved_m, position - _FRAME, _IDENTITY.copy()
-        # A step within its noise shows neither direction nor scale: in a hover, noise would seem to confirm them.
-        noise_m2 = _MIN_STEP_SIGMA**2 * (step.sd_m**2 + 2 * variance_m2)
-        part = max(0.0, 1.0 - noise_m2 / max(noise_m2, east_m**2 + north_m**2))
-        transition[_F, _K] = part * np.array([[east_m, north_m], [north_m, -east_m]])
+        matrix, transition, moved_m = position - _FRAME, _IDENTITY.copy(), np.array(step.moved_m)
+        # Scale and direction act on the true way. The noise of a measured one would seem to confirm them, and bias them
+        # in slow flight, so it is combined with the predicted way, each by its variance.
+        predicted_m, predicted_m2 = path_moved_m + matrix @ self._x, np.trace(matrix @ self._p @ matrix.T) / 2
+        weight = predicted_m2 / (predicted_m2 + step.sd_m**2 + 2 * variance_m2)
+        east_m, north_m = predicted_m + weight * (moved_m - predicted_m)
+        transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
         transition[_F, _HEADING] = transition[_F, _TURN]
         x, p = transition @ self._x, transition @ self._p @ transition.T
-        x[_F] += np.array(step.moved_m) - path_moved_m
+        x[_F] += moved_m - path_moved_m
         p[_F, _F] += step.sd_m**2 * _EYE
         if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
             self._contradictions += 1
