@@ -18,7 +18,8 @@ _MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and the frame that
 # A heading that changes by more than its rate explains is not the aircraft's turn: the compass was disturbed, or the
 # autopilot has corrected its estimate.
 _MIN_HEADING_STEP_DEG = 5.0
-_MAX_STEP_INTERVAL_S = 0.5
+_MAX_STEP_INTERVAL_S = 0.25
+_MAX_STEP_PITCH_DEG = 60.0  # near the vertical, the heading turns over in a loop
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
 # four times as fast, which is four standard deviations.
 DRIFT_M_S = 5.0
@@ -67,9 +68,12 @@ class Attitudes:
         turned_rad_s = message.pitchspeed * math.sin(message.roll) + message.yawspeed * math.cos(message.roll)
         old_deg_s, rate_deg_s = self._yaw_rate_deg_s, math.degrees(turned_rad_s / math.cos(message.pitch))
         self._yaw_rate_deg_s = rate_deg_s
-        if self._history and (step_s := now_s - self._history[-1].t_s) <= _MAX_STEP_INTERVAL_S:
+        last = self._history[-1] if self._history else None
+        if last is None or max(abs(math.degrees(message.pitch)), abs(last.pitch_deg)) > _MAX_STEP_PITCH_DEG:
+            return
+        if (step_s := now_s - last.t_s) <= _MAX_STEP_INTERVAL_S:
             turned_deg = step_s * (rate_deg_s + old_deg_s) / 2
-            step_deg = abs(wrap_deg(math.degrees(message.yaw) - self._history[-1].yaw_deg - turned_deg))
+            step_deg = abs(wrap_deg(math.degrees(message.yaw) - last.yaw_deg - turned_deg))
             if step_deg > _MIN_HEADING_STEP_DEG + step_s * abs(rate_deg_s - old_deg_s):
                 self.heading_step_deg += step_deg
 

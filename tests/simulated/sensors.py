@@ -60,6 +60,7 @@ class Receivers:
         self._index = 0
         self._switched_s = 0.0
         self._due_s = 0.0
+        self.error_m = 0j  # of the position that the simulated receiver measures
 
     @property
     def has_second(self) -> bool:
@@ -101,7 +102,7 @@ class Receivers:
     def _measure(self, truth: TrueState, before: PositionMeasurement, now_s: float) -> PositionMeasurement:
         parameters = self._parameters
         report = PositionMeasurement(
-            point=truth.point,
+            point=displace(truth.point, self.error_m),
             alt_m=truth.alt_m,
             sd_m=_SIMULATED_SD_M,
             t_s=now_s,

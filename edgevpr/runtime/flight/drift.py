@@ -35,6 +35,7 @@ _ODOMETRY_NOISE = 0.003  # random change of that error in one second
 _GPS_LOSS_TURN_FACTOR = 10.0
 _ROTATION_SD_RAD = 0.035
 _MAX_ROTATION_RAD = 0.4
+_MAX_STEPPED_ROTATION_RAD = 0.6  # after a step of the heading
 _MAX_ROTATION_SIGMA = 3.0  # a larger change: the autopilot has corrected its heading
 
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
@@ -108,7 +109,7 @@ class DriftFilter:
         self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
         self._contradictions = 0  # steps of odometry in a row that contradicted the state, since the last fix or GPS
         self._is_rotated = False  # the image of the last fix, by more than odometry is corrected for
-        self._heading_step_rad = 0.0  # sum of the unexplained steps of the heading
+        self._has_stepped = False  # the heading, without a turn, and no match has shown since that it is nearly right
         # Mean square of the attitude errors in the last pictures, divided by their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
         self._attitude_error_sd = _TYPICAL_ATTITUDE_ERROR_SD  # mean of the standard deviations of these errors
@@ -193,15 +194,18 @@ class DriftFilter:
         self._p[_SCALE] *= ratio
         self._p[:, _SCALE] *= ratio
         self._p[_SCALE, _SCALE] += (ratio * step.log_height_sd) ** 2
-        matrix, transition, moved_m = position - _FRAME, _IDENTITY.copy(), np.array(step.moved_m)
+        matrix, transition = position - _FRAME, _IDENTITY.copy()
+        scale, turn = 1.0 + self._x[_SCALE], self._x[_TURN] + self._x[_HEADING]
+        clockwise = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        moved_m = scale * clockwise @ step.moved_m
         # Scale and direction act on the true way. The noise of a measured one would seem to confirm them, and bias them
         # in slow flight, so it is combined with the predicted way, each by its variance.
         predicted_m, predicted_m2 = path_moved_m + matrix @ self._x, np.trace(matrix @ self._p @ matrix.T) / 2
         weight = predicted_m2 / (predicted_m2 + step.sd_m**2 + 2 * variance_m2)
         east_m, north_m = predicted_m + weight * (moved_m - predicted_m)
-        transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
+        transition[_F, _K] = [[east_m / scale, north_m], [north_m / scale, -east_m]]
         transition[_F, _HEADING] = transition[_F, _TURN]
-        x, p = transition @ self._x, transition @ self._p @ transition.T
+        x, p = self._x.copy(), transition @ self._p @ transition.T
         x[_F] += moved_m - path_moved_m
         p[_F, _F] += step.sd_m**2 * _EYE
         if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
@@ -216,7 +220,9 @@ class DriftFilter:
         """Correct the direction of odometry and the heading by a match whose picture is rotated by `rotation` (radians,
         clockwise) against the compass. After a large rotation, odometry is not used until a match shows a smaller one.
         The motion shows later whether the camera or the compass is rotated."""
-        self._is_rotated = abs(rotation) > _MAX_ROTATION_RAD + self._heading_step_rad
+        limit = _MAX_STEPPED_ROTATION_RAD if self._has_stepped else _MAX_ROTATION_RAD
+        self._is_rotated = abs(rotation) > limit
+        self._has_stepped &= abs(rotation) > _MAX_ROTATION_RAD
         if self._is_rotated:
             return
         matrix = np.zeros((1, _SIZE))
@@ -231,7 +237,7 @@ class DriftFilter:
         direction of odometry have been wrong by as much."""
         part = _HEADING if self._drift.is_inertial else _TURN
         self._p[part, part] += step_rad**2
-        self._heading_step_rad += step_rad
+        self._has_stepped = True
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""

@@ -32,6 +32,8 @@ _MAX_RECEIVER_SIGMA = 5.0  # a receiver farther from our position is not used to
 # A steady receiver that contradicts our position for this long is correct, unless a recent match proves our position.
 _GPS_OVERRULES_S = 2.0
 _MIN_STEADY_S = 1.0
+# A receiver that has just come back may be off. While matches prove our position, its difference counts as its error.
+_PROBATION_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,6 +125,8 @@ class Navigation:
             self._record_gps(t_s)
             offset_m = path.compute_offset_m(vehicle.lat_deg, vehicle.lon_deg) - point.position_m
             sd_m = _GPS_CORRELATION_FACTOR * (vehicle.position_sd_m or _UNKNOWN_POSITION_SD_M)
+            if vehicle.gps and self._is_on_probation(vehicle.gps, t_s):
+                sd_m = max(sd_m, float(np.hypot(*(offset_m - self._filter.estimate_errors(path.now.t_s - t_s)[0]))))
             self._filter.correct_by_gps(offset_m, sd_m, velocity_m_s - point.velocity_m_s, _GPS_VELOCITY_SD_M_S)
 
     def _correct_by_receiver(self, vehicle: Vehicle, receiver: Receiver | None) -> None:
@@ -140,6 +144,8 @@ class Navigation:
             return
         offset_m, sd_m, error_m_s, sd_m_s, age_s = error
         predicted_m, _, covariance = self._filter.estimate_errors(age_s)
+        if self._is_on_probation(receiver, vehicle.t_received_s):
+            sd_m = max(sd_m, float(np.hypot(*(offset_m - predicted_m))))
         if mahalanobis(offset_m - predicted_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _MAX_RECEIVER_SIGMA:
             self._handle_contradiction(receiver, vehicle.t_received_s)
             return
@@ -147,6 +153,9 @@ class Navigation:
         if vehicle.t_received_s - self.last_gps_s >= _GPS_INTERVAL_S:
             self._record_gps(vehicle.t_received_s)
             self._filter.correct_by_gps(offset_m, sd_m, error_m_s, sd_m_s, age_s)
+
+    def _is_on_probation(self, receiver: Receiver, now_s: float) -> bool:
+        return receiver.steady_for_s < _PROBATION_S and now_s - self.last_fix_s <= MATCH_PROOF_S
 
     def _handle_contradiction(self, receiver: Receiver, now_s: float) -> None:
         """Process a receiver that contradicts our position: restart there if this persists and no match proves ours."""

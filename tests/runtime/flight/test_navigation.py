@@ -195,6 +195,26 @@ def test_odometry_is_scaled_and_claims_the_error_of_terrain(log_height, sd, leas
     assert least_m <= math.sqrt(covariance[0, 0]) <= most_m
 
 
+@pytest.mark.parametrize(("log_height", "turn"), [(0.3, 0.0), (0.0, 0.5)])
+def test_known_scale_and_direction_of_odometry_are_applied_in_full(log_height, turn):
+    """The aircraft keeps a known velocity; its strides become shorter or turn, and that is seen."""
+    errors = DriftFilter(INERTIAL, 1.0)
+    errors.start(1.0, 0.1)
+    errors.doubt_heading(turn)
+    errors.correct_by_rotation(turn)
+    errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, None, np.zeros(2))
+    moved_m = 10 * math.cos(turn), 10 * math.sin(turn)
+    way_m = np.array((10 * math.exp(log_height), 0.0))
+    for number in range(20):
+        errors.predict(1.0, np.zeros(2))
+        height, sd = (0.0, 0.0) if number else (log_height, 0.02)
+        step = OdometryStep(
+            from_s=0.0, to_s=1.0, moved_m=moved_m, sd_m=0.2, inliers=100, log_height=height, log_height_sd=sd
+        )
+        assert errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, step, way_m)
+    assert np.hypot(*errors.estimate_errors(0.0)[0]) < 0.5
+
+
 def test_navigation_by_accelerations_alone_starts_at_a_fix():
     flown = NavigatedFlight(0, INERTIAL, fix_sd_m=2.0)
     navigation, match = flown.navigation, make_fix(Position(*HOME), -1.0, 3.0)

@@ -271,6 +271,13 @@ def test_noise_of_odometry_does_not_bias_its_scale(speed_m_s):
     assert flight.fly(100).error_m[-1] < 5, "8 and 9 if noise counts as motion"
 
 
+def test_gps_that_comes_back_wrong_does_not_outweigh_matches():
+    flight = ClosedLoop("px4-copter", velocity_m_s=5j, **SENSOR).fly(SETTLED_S).set("SIM_GPS1_ENABLE", 0).fly(20)
+    flight.brain.receivers.error_m = 15.0
+    flight.set("SIM_GPS1_ENABLE", 1).fly(4).set("SIM_GPS1_ENABLE", 0)
+    assert flight.fly(20).worst_m(flight.now_s - 24)[0] < 20, "17 without edgevpr"
+
+
 def test_px4_is_given_proven_positions_that_it_does_not_refuse():
     """Refused for seven seconds, they let it fly on from where it has drifted meanwhile."""
     flight = ClosedLoop("px4-copter", **SENSOR)
