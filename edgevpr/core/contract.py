@@ -106,11 +106,13 @@ class Support:
     `back`: fraction (0..1) of the place's regions whose most similar region in the query is at this displacement.
     `likeness`: mean cosine similarity of each region of the query to the most similar region anywhere in the place.
     `log_rank`: for each region of the query, the place's regions are ranked by similarity to it; this is the mean
-    natural logarithm of the rank (from 1) of the region at this displacement."""
+    natural logarithm of the rank (from 1) of the region at this displacement.
+    `surroundings`: `back` in the outer ring of the place, where the query shows it, divided by that in the middle."""
 
     back: float
     likeness: float
     log_rank: float
+    surroundings: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

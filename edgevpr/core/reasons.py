@@ -20,6 +20,7 @@ _FIGURES = (
     ", against {rival_landmarks:.0f} for another place",
     ", {landmarks_ratio:.2f} times as many landmarks as for the runner-up",
     ", {coverage_share:.1%} of the place agrees",
+    ", its surroundings agree {surroundings_ratio:.2f} times as much as its middle",
 )
 
 

@@ -12,13 +12,16 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Array, Ints, Singles
+from edgevpr.core.arrays import Array, Bools, Ints, Singles
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.geodesy import fit_similarity
 from edgevpr.techniques.views import ViewRegions
 
 _SHIFT_SPREAD_CELLS = 3  # difference in shift between near and far ground, with a forward camera
 _RANK_STEP = 4  # only every fourth region is ranked, because ranking is the slowest part
+_MIDDLE_SHARE = 0.7  # of the width and height of a picture; the rest is its outer ring
+_MIN_PART_REGIONS = 40  # fewer regions of the middle or ring are too few to compare
+_CHANCE_BACK = 0.02  # added to both fractions, so that a few regions do not decide their ratio
 _REGIONS_PER_PRODUCT = 256  # compared with a place at once, so that their similarities, a megabyte, stay in the cache
 _FIT_ROUNDS = 8
 _MAX_RESIDUAL_CELLS = 1.5  # maximum distance of an agreeing region from the fit
@@ -106,20 +109,36 @@ def measure_support(
     shift_x, shift_y = (round(cells) for cells in shift_cells or (0.0, 0.0))
     y, x = np.divmod(np.arange(len(reference)), side)
     distance = np.maximum(abs(x - query_x[reverse] - shift_x), abs(y - query_y[reverse] - shift_y))
+    agrees, is_visible = distance <= _SHIFT_SPREAD_CELLS, _is_inside(x - shift_x, y - shift_y, side)
     return Support(
-        back=float((distance <= _SHIFT_SPREAD_CELLS).mean()),
+        back=float(agrees.mean()),
         likeness=float(np.einsum("ij,ij->i", regions, reference[nearest]).mean()),
         log_rank=_compute_log_rank(
             regions[::_RANK_STEP], reference, query_x[::_RANK_STEP] + shift_x, query_y[::_RANK_STEP] + shift_y, side
         ),
+        surroundings=_compare_surroundings(agrees[is_visible], x[is_visible], y[is_visible], side),
     )
+
+
+def _is_inside(x: Ints, y: Ints, side: int) -> Bools:
+    return np.asarray((x >= 0) & (x < side) & (y >= 0) & (y < side))
+
+
+def _compare_surroundings(agrees: Bools, x: Ints, y: Ints, side: int) -> float:
+    """Return `Support.surroundings`; 1 if ring or middle has too few regions. `x` and `y` are the positions of the
+    place's regions that the query shows, int (N,), and `agrees` bool (N,) is True for those counted in `back`."""
+    middle = (side - 1) / 2
+    is_ring = np.maximum(abs(x - middle), abs(y - middle)) > _MIDDLE_SHARE * side / 2
+    if min(np.count_nonzero(is_ring), np.count_nonzero(~is_ring)) < _MIN_PART_REGIONS:
+        return 1.0
+    return float((agrees[is_ring].mean() + _CHANCE_BACK) / (agrees[~is_ring].mean() + _CHANCE_BACK))
 
 
 def _compute_log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
     """Return the mean log rank of the query's `regions` (n, P); the best possible is 0. `x` and `y` are their shifted
     positions in the place. The rank of a region is the number of regions of the place that resemble it more than the
     best of the 3x3 regions around its position does."""
-    rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
+    rows = np.flatnonzero(_is_inside(x, y, side))
     if not len(rows):
         return math.log(len(reference))
     similarities = regions[rows] @ reference.T

@@ -98,6 +98,17 @@ def test_support_is_computed_from_all_regions(step, asked):
     assert (found.back, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
 
 
+def test_measure_support_compares_surroundings_with_the_middle():
+    technique = create("cohog")
+    scene, other = draw_texture(1, 640, 704), draw_texture(2, 512, 512)
+    other[80:432, 80:432] = scene[80:432, 80:432]
+    for picture, low, high in ((scene[:512, :512], 0.9, 1.1), (other, 0.0, 0.2)):
+        place = technique.encode(picture).fine
+        for x in (0, 64, 128):  # pixels that the query has moved to the right, out of view of a part of the ring
+            match = technique.match(technique.encode(scene[:512, x : x + 512]), place)
+            assert low < match.support.surroundings < high
+
+
 SIDE = 31
 
 

@@ -74,8 +74,8 @@ class ConfidenceRule:
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match is correct: at most 0.5 if another place agrees about as well, and at
-        most 0.9 if landmarks are required but do not agree."""
+        """Return the probability that the match is correct: at most 0.5 if another place agrees about as well or the
+        surroundings differ, and at most 0.9 if landmarks are required but do not agree."""
         confidence = self.models[evidence.kind].confidence(evidence.figures())
         if not evidence.is_unambiguous:
             return min(confidence, _MAX_TWIN_CONFIDENCE)

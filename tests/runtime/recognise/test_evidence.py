@@ -39,8 +39,9 @@ def rank(matches):
     return Ranking(slots=np.array(slots, int), scores=scores, compared=matches)
 
 
-def forward(score, back=0.2, likeness=0.7, log_rank=0.0):
-    return FineMatch(score, coverage=0.3, support=Support(back=back, likeness=likeness, log_rank=log_rank))
+def forward(score, back=0.2, likeness=0.7, log_rank=0.0, surroundings=1.0):
+    support = Support(back=back, likeness=likeness, log_rank=log_rank, surroundings=surroundings)
+    return FineMatch(score, coverage=0.3, support=support)
 
 
 def see_forward(matches, look_alikes=None):
@@ -111,6 +112,13 @@ SMALL_LEAD = replace(CLEAR_LEAD, lead=math.log(1.49))
 )
 def test_needs_landmarks_if_forward_regions_are_not_sufficient(evidence, needed):
     assert evidence.needs_landmarks == needed
+
+
+def test_evidence_is_ambiguous_if_only_the_middle_agrees():
+    same, other = (see_forward({5: forward(0.2, surroundings=ratio)}) for ratio in (0.46, 0.44))
+    assert (same.is_unambiguous, other.is_unambiguous) == (True, False)
+    ratios = [evidence.describe()["surroundings_ratio"] for evidence in (same, other)]
+    assert ratios == [None, pytest.approx(0.44)]
 
 
 def test_list_evidence_kinds_depends_on_the_camera():
