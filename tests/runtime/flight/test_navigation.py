@@ -1,6 +1,7 @@
 """Navigation between fixes: with a true flight beside it, how wrong it is, and whether it knows."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,8 @@ from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatc
 from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
+
+STRIDE = partial(OdometryStep, from_s=0.0, to_s=1.0, sd_m=0.2, inliers=100)
 
 
 def make_fix(position, t_s, fix_sd_m, attitude_error=None, **frame):
@@ -186,9 +189,7 @@ def test_odometry_is_scaled_and_claims_the_error_of_terrain(log_height, sd, leas
     for number in range(10):
         errors.predict(1.0, np.zeros(2))
         change, change_sd = (0.0, 0.0) if number else (log_height, sd)
-        step = OdometryStep(
-            from_s=0.0, to_s=1.0, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, log_height=change, log_height_sd=change_sd
-        )
+        step = STRIDE(moved_m=(10.0, 0.0), log_height=change, log_height_sd=change_sd)
         assert errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, step, np.zeros(2))
     offset_m, _, covariance = errors.estimate_errors(0.0)
     assert offset_m == pytest.approx((100 * math.exp(log_height), 0.0), abs=1.0)
@@ -197,20 +198,16 @@ def test_odometry_is_scaled_and_claims_the_error_of_terrain(log_height, sd, leas
 
 @pytest.mark.parametrize(("log_height", "turn"), [(0.3, 0.0), (0.0, 0.5)])
 def test_known_scale_and_direction_of_odometry_are_applied_in_full(log_height, turn):
-    """The aircraft keeps a known velocity; its strides become shorter or turn, and that is seen."""
     errors = DriftFilter(INERTIAL, 1.0)
     errors.start(1.0, 0.1)
     errors.doubt_heading(turn)
     errors.correct_by_rotation(turn)
     errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, None, np.zeros(2))
-    moved_m = 10 * math.cos(turn), 10 * math.sin(turn)
-    way_m = np.array((10 * math.exp(log_height), 0.0))
+    moved_m, way_m = (10 * math.cos(turn), 10 * math.sin(turn)), np.array((10 * math.exp(log_height), 0.0))
     for number in range(20):
         errors.predict(1.0, np.zeros(2))
         height, sd = (0.0, 0.0) if number else (log_height, 0.02)
-        step = OdometryStep(
-            from_s=0.0, to_s=1.0, moved_m=moved_m, sd_m=0.2, inliers=100, log_height=height, log_height_sd=sd
-        )
+        step = STRIDE(moved_m=moved_m, log_height=height, log_height_sd=sd)
         assert errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, step, way_m)
     assert np.hypot(*errors.estimate_errors(0.0)[0]) < 0.5
 

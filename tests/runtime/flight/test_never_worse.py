@@ -266,8 +266,7 @@ def test_positions_end_when_a_compass_has_jumped_in_a_hover(turned_deg):
 @pytest.mark.parametrize("speed_m_s", [0.4, 8.0])
 def test_noise_of_odometry_does_not_bias_its_scale(speed_m_s):
     flight = ClosedLoop("arducopter", velocity_m_s=speed_m_s * 1j, **GPS_INPUT).fly(20)
-    flight.set("SIM_GPS1_ENABLE", 0).fly(15)
-    flight.matches = False
+    flight.set("SIM_GPS1_ENABLE", 0).fly(15).matches = False
     assert flight.fly(100).error_m[-1] < 5, "8 and 9 if noise counts as motion"
 
 
@@ -279,7 +278,6 @@ def test_gps_that_comes_back_wrong_does_not_outweigh_matches():
 
 
 def test_px4_is_given_proven_positions_that_it_does_not_refuse():
-    """Refused for seven seconds, they let it fly on from where it has drifted meanwhile."""
     flight = ClosedLoop("px4-copter", **SENSOR)
     flight.show_tilt = True
     flight.fly(SETTLED_S).set("SIM_GPS1_ENABLE", 0).fly(20)
