@@ -90,6 +90,10 @@ class Navigation:
         """Current velocity (2,) of the path, without corrections from matches; None if unknown."""
         return self._valid_path.now.velocity_m_s if self._valid_path else None
 
+    def is_proven(self, t_s: float) -> bool:
+        """Return True if a recent match proves our position."""
+        return t_s - self.last_fix_s <= MATCH_PROOF_S
+
     def is_tracked(self, t_s: float) -> bool:
         """Return True if visual odometry tracks the path without contradiction, and queries are frequent enough that
         several would soon reveal an error of the path."""
@@ -125,8 +129,8 @@ class Navigation:
             self._record_gps(t_s)
             offset_m = path.compute_offset_m(vehicle.lat_deg, vehicle.lon_deg) - point.position_m
             sd_m = _GPS_CORRELATION_FACTOR * (vehicle.position_sd_m or _UNKNOWN_POSITION_SD_M)
-            if vehicle.gps and self._is_on_probation(vehicle.gps, t_s):
-                sd_m = max(sd_m, float(np.hypot(*(offset_m - self._filter.estimate_errors(path.now.t_s - t_s)[0]))))
+            predicted_m, _, _ = self._filter.estimate_errors(path.now.t_s - t_s)
+            sd_m = self._compute_gps_sd_m(sd_m, offset_m - predicted_m, vehicle.gps, t_s)
             self._filter.correct_by_gps(offset_m, sd_m, velocity_m_s - point.velocity_m_s, _GPS_VELOCITY_SD_M_S)
 
     def _correct_by_receiver(self, vehicle: Vehicle, receiver: Receiver | None) -> None:
@@ -144,8 +148,7 @@ class Navigation:
             return
         offset_m, sd_m, error_m_s, sd_m_s, age_s = error
         predicted_m, _, covariance = self._filter.estimate_errors(age_s)
-        if self._is_on_probation(receiver, vehicle.t_received_s):
-            sd_m = max(sd_m, float(np.hypot(*(offset_m - predicted_m))))
+        sd_m = self._compute_gps_sd_m(sd_m, offset_m - predicted_m, receiver, vehicle.t_received_s)
         if mahalanobis(offset_m - predicted_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _MAX_RECEIVER_SIGMA:
             self._handle_contradiction(receiver, vehicle.t_received_s)
             return
@@ -154,12 +157,14 @@ class Navigation:
             self._record_gps(vehicle.t_received_s)
             self._filter.correct_by_gps(offset_m, sd_m, error_m_s, sd_m_s, age_s)
 
-    def _is_on_probation(self, receiver: Receiver, now_s: float) -> bool:
-        return receiver.steady_for_s < _PROBATION_S and now_s - self.last_fix_s <= MATCH_PROOF_S
+    def _compute_gps_sd_m(self, sd_m: float, difference_m: Doubles, receiver: Receiver | None, now_s: float) -> float:
+        """Return the standard deviation to assume for a GPS position that claims `sd_m` and differs from ours (2,)."""
+        has_returned = receiver is not None and receiver.steady_for_s < _PROBATION_S
+        return max(sd_m, float(np.hypot(*difference_m))) if has_returned and self.is_proven(now_s) else sd_m
 
     def _handle_contradiction(self, receiver: Receiver, now_s: float) -> None:
         """Process a receiver that contradicts our position: restart there if this persists and no match proves ours."""
-        self.has_gps, self.is_in_doubt = False, now_s - self.last_fix_s > MATCH_PROOF_S
+        self.has_gps, self.is_in_doubt = False, not self.is_proven(now_s)
         if self._contradicted_since_s is None:
             self._contradicted_since_s = now_s
         contradicted_s = min(receiver.steady_for_s, now_s - self._contradicted_since_s)

@@ -27,7 +27,7 @@ from edgevpr.runtime.flight.measurements import (
     position_match,
 )
 from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
-from edgevpr.runtime.flight.output import MATCH_PROOF_S, Output, OutputWatch
+from edgevpr.runtime.flight.output import Output, OutputWatch
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -273,9 +273,6 @@ class Navigator(Listener):
         east, north = estimate.velocity_m_s
         attitude, factor = self._attitude, self._correlation_factor(vehicle, t_s)
         accuracy_m = factor * math.hypot(self._compute_claimed_m(estimate), lag_m)
-        if self._channel is Channel.SENSOR and t_s - self._navigation.last_fix_s <= MATCH_PROOF_S:
-            away_m = float(distance_m(lat_deg, lon_deg, vehicle.lat_deg, vehicle.lon_deg))
-            accuracy_m = max(accuracy_m, away_m / _PX4_GATE_SIGMA if away_m <= _MAX_PX4_DISTANCE_M else 0.0)
         is_fallback, receiver = self.output is Output.RESERVE, vehicle.gps
         return MotionState(
             t_mono_s=t_s,
@@ -284,7 +281,7 @@ class Navigator(Listener):
             # The autopilot's own altitude may come from us, so with a receiver its altitude is sent.
             alt_m=receiver.alt_m if is_fallback and receiver and receiver.alt_m is not None else vehicle.alt_m,
             velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-            accuracy_m=accuracy_m,
+            accuracy_m=max(accuracy_m, self._compute_usable_accuracy_m(vehicle, lat_deg, lon_deg, t_s)),
             alt_accuracy_m=_ALT_SD_M,
             speed_accuracy_m_s=factor * estimate.speed_accuracy_m_s,
             attitude=None if attitude is None else _to_radians(attitude),
@@ -405,6 +402,13 @@ class Navigator(Listener):
             return 1.0
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
+
+    def _compute_usable_accuracy_m(self, vehicle: Vehicle, lat_deg: float, lon_deg: float, t_s: float) -> float:
+        """Return the smallest accuracy with which PX4 uses a position that matches prove; 0 if it need not."""
+        if self._channel is not Channel.SENSOR or not self._navigation.is_proven(t_s):
+            return 0.0
+        away_m = float(distance_m(lat_deg, lon_deg, vehicle.lat_deg, vehicle.lon_deg))
+        return away_m / _PX4_GATE_SIGMA if away_m <= _MAX_PX4_DISTANCE_M else 0.0
 
     def _compute_accuracy_m(self, estimate: NavState) -> float:
         """Return the accuracy of an estimate: not better than a camera tilt allows, which no filter averages out."""

@@ -19,7 +19,7 @@ from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4_INERTIAL_ERROR
 from edgevpr.runtime.flight.consistency import PredictedFix
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4, DriftFilter
-from edgevpr.runtime.flight.navigation import NavState
+from edgevpr.runtime.flight.navigation import Navigation, NavState
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.perspective import AttitudeError
@@ -32,11 +32,14 @@ INFLATION = math.sqrt(50)
 class KnownNavigation:
     """What navigation says of the position: `off_m` (2,) from HOME, so many metres and seconds ago."""
 
+    is_proven = Navigation.is_proven
+
     def __init__(self, *, off_m=(0.0, 0.0), accuracy_m=2.0, shown_ago_s=0.0, gps_ago_s=NEVER_S, drift_m_s=(0.0, 0.0)):
         self.off_m, self.accuracy_m, self.drift_m_s = off_m, accuracy_m, drift_m_s
         self.last_vision_s = self.last_fix_s = NOW_S - shown_ago_s
         self.last_gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
         self.frames, self.begun, self.contradicts_m, self.is_confirmed = [], [], 0.0, True
+        self.is_tracked = lambda t_s: False
         self.add_report = self.add_acceleration = self.correct_by_fix = self.restart_odometry_scale = lambda *_: None
 
     def estimate_state(self, t_s):
@@ -57,9 +60,6 @@ class KnownNavigation:
 
     def start_at_fix(self, *how):
         self.begun.append(how)
-
-    def is_tracked(self, t_s):
-        return False
 
     def path_drift_m_s(self):
         return self.drift_m_s
