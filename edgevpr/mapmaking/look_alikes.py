@@ -24,19 +24,10 @@ from edgevpr.places.ranking import MAX_NEIGHBOUR_SLOTS, outside_neighbourhood
 from edgevpr.places.retrieve import Query, compare_places, scan_index
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise import evidence
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import (
-    CHANCE_SHARE,
-    SMALL_LEAD,
-    LookAlike,
-    LookAlikes,
-    compute_share,
-    count_neighbours,
-    list_evidence_kinds,
-    log_share,
-)
 from edgevpr.runtime.recognise.judge import AcceptRule, make_accept_rule
 from edgevpr.runtime.recognise.opening import create_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -70,7 +61,7 @@ class MapSearch:
         index = self.index
         distances_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
         slots_away = abs(np.arange(len(index)) - slot)
-        follows_route = count_neighbours(self.rule.look_alikes) > 0
+        follows_route = evidence.count_neighbours(self.rule.look_alikes) > 0
         is_adjacent = slots_away <= (_MAX_OVERLAP_SLOTS if follows_route else 0)
         return np.where(np.isnan(distances_m), is_adjacent, distances_m <= _MAX_OVERLAP_FOOTPRINTS * self.near_m)
 
@@ -84,7 +75,7 @@ class MapSearch:
         return recogniser.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
 
-def measure_look_alikes(search: MapSearch, pictures: Iterable[tuple[int, Descriptor]]) -> LookAlikes:
+def measure_look_alikes(search: MapSearch, pictures: Iterable[tuple[int, Descriptor]]) -> evidence.LookAlikes:
     """Compare the pictures of a map for a forward camera with its places: the neighbours in mapping order, and those
     elsewhere that a search finds. `pictures`: pairs of a place id and the descriptor of its picture. Raises MapError if
     the map cannot be read."""
@@ -114,24 +105,24 @@ def measure_look_alikes(search: MapSearch, pictures: Iterable[tuple[int, Descrip
                 agreements[one][two] = max(agreement, agreements[one].get(two, agreement))
     best_adjacent = {slot: _find_best(others, select_adjacent(slot))[1] for slot, others in agreements.items()}
     best_opposite = [_find_best(others, select_opposite(slot))[1] for slot, others in agreements.items()]
-    typical, chance = float(np.median(list(best_adjacent.values()))), log_share(CHANCE_SHARE)
+    typical, chance = float(np.median(list(best_adjacent.values()))), evidence.log_share(evidence.CHANCE_SHARE)
     # Along a route, pictures agree better with the adjacent ones than with as many others.
-    overlaps = typical >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
+    overlaps = typical >= max(chance, float(np.median(best_opposite)) + evidence.SMALL_LEAD)
     places = {}
     for slot, others in agreements.items():
         look_alike, agreement = _find_best(others, select_elsewhere(slot, MAX_NEIGHBOUR_SLOTS if overlaps else 0))
         usual = max(typical, best_adjacent[slot]) if overlaps else chance
         if look_alike is not None:
-            other_id = int(index.place_ids[look_alike])
-            places[int(index.place_ids[slot])] = LookAlike(other_id, round(agreement, _DIGITS), round(usual, _DIGITS))
-    return LookAlikes(overlap=overlaps, places=places)
+            place_id, other_id = int(index.place_ids[slot]), int(index.place_ids[look_alike])
+            places[place_id] = evidence.LookAlike(other_id, round(agreement, _DIGITS), round(usual, _DIGITS))
+    return evidence.LookAlikes(overlap=overlaps, places=places)
 
 
 def _find_best(agreements: Mapping[int, float], is_selected: Bools) -> tuple[int | None, float]:
     """Return the slot and the log agreement of the best-agreeing place where `is_selected`, bool (N,), is True. If no
     agreement is known there, return None and the log of no agreement."""
     slot = max((slot for slot in agreements if is_selected[slot]), key=agreements.__getitem__, default=None)
-    return slot, log_share(0.0) if slot is None else agreements[slot]
+    return slot, evidence.log_share(0.0) if slot is None else agreements[slot]
 
 
 def _search_parts(search: MapSearch, descriptor: Descriptor, parts: Iterable[Bools]) -> Iterator[tuple[int, float]]:
@@ -143,7 +134,7 @@ def _search_parts(search: MapSearch, descriptor: Descriptor, parts: Iterable[Boo
         if len(slots):
             query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index.select(slots))
             for position, match in compare_places(query, scan_index(query), technique.candidates, 0.0).compared.items():
-                yield int(slots[position]), log_share(compute_share(match))
+                yield int(slots[position]), evidence.log_share(evidence.compute_share(match))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +153,7 @@ def find_look_alikes(
     that looks like it (None: no such place). Skipped are places without a position, and pictures from which their place
     was not made; nothing is yielded for a technique without a confidence. Raises MapError if the map cannot be read."""
     technique = create_technique(place_map)
-    if not list_evidence_kinds(technique.spec):
+    if not evidence.list_evidence_kinds(technique.spec):
         return
     rule = make_accept_rule(technique, MatchConfig(), 1, read_calibration_for(place_map))
     search = MapSearch(place_map, technique, rule, QueryMeter(load_board("this")))

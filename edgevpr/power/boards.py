@@ -6,15 +6,7 @@ module also detects the board that it runs on. The flight, `edgevpr profile` and
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from edgevpr.core.config import (
-    BUDGET_RANGE_MB,
-    MAX_RATE_HZ,
-    MIN_RATE_HZ,
-    MemoryConfig,
-    SourceConfig,
-    bounded_key,
-    build,
-)
+from edgevpr.core import config
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import find_shipped
 from edgevpr.core.text import suggest
@@ -29,7 +21,7 @@ class MachineSpeed:
     """Speed of a machine. `arm64_mips`: million instructions per second of one thread of an aarch64 board (None:
     unknown, or another processor). `verified`: True if `source` measured the figure on this very board."""
 
-    arm64_mips: float | None = bounded_key(1, 1_000_000, default=None)
+    arm64_mips: float | None = config.bounded_key(1, 1_000_000, default=None)
     verified: bool
     source: str
 
@@ -50,19 +42,19 @@ class Board:
     name: str
     title: str
     recognised_by: str | None
-    ram_mb: float = bounded_key(64, 4_000_000)
-    cores: int = bounded_key(1, 1024)
-    idle_w: float = bounded_key(0, 1000)
-    full_w: float = bounded_key(0.01, 1000)
+    ram_mb: float = config.bounded_key(64, 4_000_000)
+    cores: int = config.bounded_key(1, 1024)
+    idle_w: float = config.bounded_key(0, 1000)
+    full_w: float = config.bounded_key(0.01, 1000)
     verified: bool
     source: str
-    rate_hz: float = bounded_key(MIN_RATE_HZ, MAX_RATE_HZ)
-    cpu_share: float = bounded_key(0.01, 1)
-    budget_mb: float = bounded_key(*BUDGET_RANGE_MB)
-    memory_max_mb: float = bounded_key(1, 4_000_000)
-    thermal_limit_c: float | None = bounded_key(30, 125)
+    rate_hz: float = config.bounded_key(config.MIN_RATE_HZ, config.MAX_RATE_HZ)
+    cpu_share: float = config.bounded_key(0.01, 1)
+    budget_mb: float = config.bounded_key(*config.BUDGET_RANGE_MB)
+    memory_max_mb: float = config.bounded_key(1, 4_000_000)
+    thermal_limit_c: float | None = config.bounded_key(30, 125)
     benchmark_score: MachineSpeed
-    threads: int = bounded_key(1, 64, default=1)
+    threads: int = config.bounded_key(1, 64, default=1)
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:
         """Return True if this is the profile of the machine that edgevpr runs on."""
@@ -88,7 +80,7 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
     raise ConfigError(f"There is no board `{name}`: {hint}")
 
 
-def resolve_board(board: Board, source: SourceConfig, memory: MemoryConfig) -> Board:
+def resolve_board(board: Board, source: config.SourceConfig, memory: config.MemoryConfig) -> Board:
     """Return the board with its query rate and index memory replaced by configured values, if any."""
     return replace(board, rate_hz=source.rate_hz or board.rate_hz, budget_mb=memory.budget_mb or board.budget_mb)
 
@@ -104,7 +96,7 @@ def _read_shipped_board(name: str) -> Board:
 
 
 def _read_board(path: Path) -> Board:
-    board = build(Board, {"name": path.stem, **read_yaml(path)}, str(path))
+    board = config.build(Board, {"name": path.stem, **read_yaml(path)}, str(path))
     if board.full_w < board.idle_w:
         raise ConfigError(f"{path}: `full_w` ({board.full_w:g}) is below `idle_w` ({board.idle_w:g}): correct them.")
     if not board.budget_mb <= board.memory_max_mb <= board.ram_mb:

@@ -10,17 +10,8 @@ from typing import Any
 from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.frames.level import Lens, Mount
+from edgevpr.review import logged
 from edgevpr.review.album import Album
-from edgevpr.review.logged import (
-    SENT_OUTCOMES,
-    FixOutcome,
-    LoggedFlight,
-    LoggedQuery,
-    get_number,
-    get_point,
-    get_text,
-    get_value,
-)
 from edgevpr.review.webpage import (
     UNKNOWN,
     Chart,
@@ -38,23 +29,25 @@ from edgevpr.review.webpage import (
 _MAX_REMARKS = 200
 _MAX_GPS_ERROR_M = 15.0  # smaller distances are within the receiver's error, and not dangerous
 _FIX_COLOURS = {
-    FixOutcome.ACCEPTED: "taken",
-    FixOutcome.UNANSWERED: "unanswered",
-    FixOutcome.REFUSED: "refused",
-    FixOutcome.CONTINUOUS: "taken",
-    FixOutcome.NOT_SENT: "places",
+    logged.FixOutcome.ACCEPTED: "taken",
+    logged.FixOutcome.UNANSWERED: "unanswered",
+    logged.FixOutcome.REFUSED: "refused",
+    logged.FixOutcome.CONTINUOUS: "taken",
+    logged.FixOutcome.NOT_SENT: "places",
 }
 _HEAD_FIELDS = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
 
 
 def make_flight_page(
-    flight: LoggedFlight, places: Sequence[Place], frames: Album, references: Album, no_places: str = ""
+    flight: logged.LoggedFlight, places: Sequence[Place], frames: Album, references: Album, no_places: str = ""
 ) -> str:
     """Return the page. `places`: the map's places. `frames`: album of the flight's pictures; `references`: album
     of the map's. `no_places`: a sentence on why `places` is empty."""
     queries = flight.queries
-    time = get_text(flight.start, "time") or next((get_text(query.line, "time") for query in queries), None)
-    start = [f"{name} {value}" for name, key in _HEAD_FIELDS if (value := get_text(flight.start, key))]
+    time = logged.get_text(flight.start, "time") or next(
+        (logged.get_text(query.line, "time") for query in queries), None
+    )
+    start = [f"{name} {value}" for name, key in _HEAD_FIELDS if (value := logged.get_text(flight.start, key))]
     head = {
         "title": f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time",
         "known": [f"{format_duration(flight.span_s)} long", *start, str(flight.path)],
@@ -75,12 +68,12 @@ def make_flight_page(
     )
 
 
-def _make_layers(places: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
+def _make_layers(places: Sequence[Place], flight: logged.LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, bottom layer first."""
     return [
         Layer("places of the map", "places", [[to_point(place.position) for place in places]]),
         make_layer(steps, "places found", "found"),
-        Layer("fixes between matches", "between", [list(filter(None, map(get_point, flight.between)))]),
+        Layer("fixes between matches", "between", [list(filter(None, map(logged.get_point, flight.between)))]),
         make_layer(steps, "GPS", "gps", "line"),
         make_layer(steps, "autopilot", "autopilot", "line"),
         make_layer(steps, "positions of refused queries", "refused_at"),
@@ -91,14 +84,14 @@ def _make_layers(places: Sequence[Place], flight: LoggedFlight, steps: Sequence[
     ]
 
 
-def _make_steps(places: Sequence[Place], flight: LoggedFlight) -> list[Step]:
+def _make_steps(places: Sequence[Place], flight: logged.LoggedFlight) -> list[Step]:
     """Return a step for each query of a flight over the map places `places`."""
     by_id = {place.place_id: place for place in places}
     has_link = any(query.has_link for query in flight.queries)
     return [_make_step(query, by_id.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
 
 
-def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
+def _make_step(query: logged.LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
     """Return the step of a query. `has_times`: the flight has times. `has_link`: it had a link to an autopilot."""
     fix, verdict = query.fix, "accepted" if query.accepted else "refused"
     points = {
@@ -113,7 +106,7 @@ def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_lin
     if fix:
         summary = f": {fix.why.code.summary}" if fix.why else ""
         groups[f"{fix.outcome.value}{summary}"] = _FIX_COLOURS[fix.outcome]
-        if fix.outcome in SENT_OUTCOMES:
+        if fix.outcome in logged.SENT_OUTCOMES:
             points[_FIX_COLOURS[fix.outcome]] = fix.position
     if (query.off_m or 0.0) > _MAX_GPS_ERROR_M:
         groups[f"match over {_MAX_GPS_ERROR_M:.0f} m from GPS"] = "refused"
@@ -133,15 +126,15 @@ def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_lin
     )
 
 
-def _format_place(query: LoggedQuery) -> str:
+def _format_place(query: logged.LoggedQuery) -> str:
     if query.place is None:
         return "no place found"
-    score = format_number(get_number(query.line, "score"))
+    score = format_number(logged.get_number(query.line, "score"))
     confidence = "" if query.confidence is None else f", confidence {format_probability(query.confidence)}"
     return f"place {query.place} ({query.reference_image or 'unnamed'}), score {score}{confidence}"
 
 
-def _format_position(query: LoggedQuery) -> str:
+def _format_position(query: logged.LoggedQuery) -> str:
     if not query.position:
         return ""
     accuracy = "" if query.accuracy_m is None else f", accurate to {format_number(query.accuracy_m, 'm')}"
@@ -152,13 +145,13 @@ def _format_position(query: LoggedQuery) -> str:
 def _read_lens(start: Mapping[str, Any]) -> Lens | None:
     """Return the lens of the flight's camera from the first line of its log; None if it is unknown."""
     names = ("fov_deg", "up_deg", "mount_ahead_deg", "mount_right_deg")
-    fov_deg, up_deg, ahead_deg, right_deg = (get_number(start, "config", "source", name) for name in names)
+    fov_deg, up_deg, ahead_deg, right_deg = (logged.get_number(start, "config", "source", name) for name in names)
     if fov_deg is None or not 0 < fov_deg < 180:
         return None
     return Lens(fov_deg, up_deg or 0.0, mount=Mount(ahead_deg or 0.0, right_deg or 0.0))
 
 
-def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
+def _compute_figures(flight: logged.LoggedFlight) -> dict[str, str]:
     """Return the figures of a flight by name."""
     queries, accepted = flight.queries, [query for query in flight.queries if query.accepted]
     percentage = f" ({len(accepted) / len(queries):.0%})" if queries else ""
@@ -175,20 +168,20 @@ def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
         "from GPS, maximum": format_number(max(off_m, default=None), "m"),
         "unusable frames": str(flight.unusable) if flight.unusable else UNKNOWN,
         "longest time without a match": format_number(max(end - start for start, end in pairwise(match_times_s)), "s"),
-        "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT_OUTCOMES)}{between}",
-        "fixes accepted": str(outcomes[FixOutcome.ACCEPTED]),
+        "fixes sent": f"{sum(outcomes[outcome] for outcome in logged.SENT_OUTCOMES)}{between}",
+        "fixes accepted": str(outcomes[logged.FixOutcome.ACCEPTED]),
         "charge": format_number(_find_highest(flight, "totals", "used_mah"), "mAh"),
         "RAM, maximum": format_number(_find_highest(flight, "costs", "rss_mb"), "MB"),
         "temperature, maximum": format_number(_find_highest(flight, "board", "temperature_c"), "°C"),
     }
 
 
-def _find_highest(flight: LoggedFlight, *keys: str) -> float | None:
-    values = (get_number(query.line, *keys) for query in flight.queries)
+def _find_highest(flight: logged.LoggedFlight, *keys: str) -> float | None:
+    values = (logged.get_number(query.line, *keys) for query in flight.queries)
     return max((value for value in values if value is not None), default=None)
 
 
-def _list_warnings(flight: LoggedFlight, has_map_places: bool, no_places: str) -> list[str]:
+def _list_warnings(flight: logged.LoggedFlight, has_map_places: bool, no_places: str) -> list[str]:
     queries = flight.queries
     has_places = has_map_places or any(query.place_position for query in queries)
     warnings = [
@@ -205,9 +198,9 @@ def _list_warnings(flight: LoggedFlight, has_map_places: bool, no_places: str) -
     return [sentence for is_fine, sentence in warnings if not is_fine]
 
 
-def _make_charts(flight: LoggedFlight) -> list[Chart]:
+def _make_charts(flight: logged.LoggedFlight) -> list[Chart]:
     def make_line(name: str, colour: str, scale: float, *keys: str) -> Series:
-        values = [(query.t_s, get_number(query.line, *keys)) for query in flight.queries]
+        values = [(query.t_s, logged.get_number(query.line, *keys)) for query in flight.queries]
         return name, colour, "line", [(t_s, scale * value) for t_s, value in values if value is not None]
 
     def make_dots(name: str, colour: str, values: Sequence[float | None]) -> Series:
@@ -236,7 +229,7 @@ def _make_charts(flight: LoggedFlight) -> list[Chart]:
     ]  # fmt: skip
 
 
-def _make_remarks(flight: LoggedFlight) -> list[Section]:
+def _make_remarks(flight: logged.LoggedFlight) -> list[Section]:
     """Return the section of messages reported in flight; none if there were no messages."""
     rows = [(format_duration(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MAX_REMARKS]]
     left_out = len(flight.remarks) - len(rows)
@@ -244,9 +237,9 @@ def _make_remarks(flight: LoggedFlight) -> list[Section]:
     return [Section("Messages", lines, [("time", "source", "message"), *rows])] if rows else []
 
 
-def _make_settings(flight: LoggedFlight) -> list[Section]:
+def _make_settings(flight: logged.LoggedFlight) -> list[Section]:
     """Return the section with the configuration; none if the log has no configuration."""
-    reason, config = get_text(flight.start, "decided", "reason"), get_value(flight.start, "config")
+    reason, config = logged.get_text(flight.start, "decided", "reason"), logged.get_value(flight.start, "config")
     if not isinstance(config, dict):
         return []
     return [Section("Configuration", [reason] if reason else [], folded=json.dumps(config, indent=1))]

@@ -26,26 +26,9 @@ from edgevpr.core.contract import (
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.techniques import cohog_tuning as tuning
-from edgevpr.techniques import layout, overlay, placecode
+from edgevpr.techniques import displacement, gradients, layout, overlay, placecode
 from edgevpr.techniques.contrast import stretch_contrast
-from edgevpr.techniques.displacement import (
-    compute_vote_fraction,
-    find_most_similar,
-    fit_alignment,
-    locate_regions,
-    match_view,
-)
 from edgevpr.techniques.entropy import average_blocks, find_good_blocks
-from edgevpr.techniques.gradients import (
-    compute_histograms,
-    make_grey_square,
-    make_mask_square,
-    make_slow_patterns,
-    normalise_blocks,
-    normalise_rows,
-    pad_to_square,
-    round_levels,
-)
 from edgevpr.techniques.layout import ROTATIONS
 from edgevpr.techniques.perspective import fit_perspective
 from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, compute_scale, decode_hypothesis
@@ -83,7 +66,9 @@ class CoHog:
         if finds_height:
             self._hypotheses = range(len(HEIGHT_RATIOS) * ROTATIONS)
         # Converts blocks, float32 (N, 4 bins), to the vectors of length 1 that `matching` compares.
-        self._make_vectors: Callable[[Singles], Singles] = self._make_patterns if self._votes else normalise_rows
+        self._make_vectors: Callable[[Singles], Singles] = (
+            self._make_patterns if self._votes else gradients.normalise_rows
+        )
         self._query: Descriptor | None = None
         self._views: QueryViews | None = None
         code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
@@ -129,12 +114,12 @@ class CoHog:
         Returns coarse uint8 (12, 12, bins), or uint8 (1120,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
         float32 (blocks, 4 bins) and good bool (blocks,): the rows of matrix A of thesis 6.2.3."""
         if self._is_nadir:
-            image, mask = pad_to_square(image, mask)
-        grey, allowed = make_grey_square(image, self.w1), make_mask_square(mask, self.w1)
+            image, mask = gradients.pad_to_square(image, mask)
+        grey, allowed = gradients.make_grey_square(image, self.w1), gradients.make_mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
         grey = stretch_contrast(grey, allowed, pixel_px, *tuning.CONTRAST[self.camera])
         blocks, seen = self._make_blocks(grey, allowed, self.w2)
-        good = find_good_blocks(round_levels(grey), self.entropy, self.w2, self.gt, eligible=seen)
+        good = find_good_blocks(gradients.round_levels(grey), self.entropy, self.w2, self.gt, eligible=seen)
         regions = blocks.reshape(-1, 4 * self.bins)
         # Store square roots in 8 bits: most values are small, and square roots preserve their precision better.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
@@ -152,11 +137,12 @@ class CoHog:
     def _encode_view(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
         """Encode a view (see `views.Encode`). Good blocks have only `allowed` pixels and at least the entropy `gt`."""
         blocks, seen = self._make_blocks(grey, allowed, cell_px)
-        return blocks, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, eligible=seen)
+        return blocks, find_good_blocks(gradients.round_levels(grey), self.entropy, cell_px, self.gt, eligible=seen)
 
     def _make_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
         """Return a square image's blocks, float32 (n, n, 4 bins), and bool (n, n), True for fully `allowed` ones."""
-        blocks = normalise_blocks(compute_histograms(grey, cell_px, self.bins, signed=True, allowed=allowed))
+        histograms = gradients.compute_histograms(grey, cell_px, self.bins, signed=True, allowed=allowed)
+        blocks = gradients.normalise_blocks(histograms)
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)
         return blocks, average_blocks(allowed.astype(np.float32), cell_px) >= 1.0
@@ -214,7 +200,7 @@ class CoHog:
             best, match, nearest = self._find_best_hypothesis(query, reference, hypotheses)
             if self._votes:
                 view = self._make_view(query, best)
-                match = fit_alignment((view.indices, view.side), (nearest, self._side), match)
+                match = displacement.fit_alignment((view.indices, view.side), (nearest, self._side), match)
         else:
             match, _ = self._match_view(self._make_view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
@@ -235,11 +221,11 @@ class CoHog:
         ratio, step_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), 360 / ROTATIONS
         turn = round((match.rotation_deg or 0.0) / step_deg) % ROTATIONS
         view = self._make_view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
-        nearest = find_most_similar(view.regions, self._restore_regions(fine))
+        nearest = displacement.find_most_similar(view.regions, self._restore_regions(fine))
         scale, offset_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
         fit = fit_perspective(
-            locate_regions(view.indices, view.side),
-            locate_regions(nearest, self._side),
+            displacement.locate_regions(view.indices, view.side),
+            displacement.locate_regions(nearest, self._side),
             complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(offset_deg))),
             complex(*(match.shift_cells or (0.0, 0.0))),
         )
@@ -295,9 +281,8 @@ class CoHog:
 
     def _make_structure(self, blocks: Singles, seen: Bools) -> Singles:
         """Return the structure (see `overlay`) of the image with these blocks, float32 (n, n, 4 bins)."""
-        return overlay.compute_structure(
-            self._make_patterns(blocks.reshape(-1, 4 * self.bins)), seen, tuning.SURROUND_SD_CELLS[self.camera]
-        )
+        patterns = self._make_patterns(blocks.reshape(-1, 4 * self.bins))
+        return overlay.compute_structure(patterns, seen, tuning.SURROUND_SD_CELLS[self.camera])
 
     def score_quickly(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
@@ -309,8 +294,8 @@ class CoHog:
             best, match, _ = self._find_best_hypothesis(query, reference, hypotheses)
             return match.score, [best]
         view = self._make_view(query, self._hypotheses[0])
-        nearest = find_most_similar(view.regions[:: tuning.QUICK_STEP], reference)
-        return compute_vote_fraction(
+        nearest = displacement.find_most_similar(view.regions[:: tuning.QUICK_STEP], reference)
+        return displacement.compute_vote_fraction(
             view.indices[:: tuning.QUICK_STEP], nearest, (view.side, self._side), tuning.VOTE_WEIGHTS[self.camera]
         ), None
 
@@ -334,11 +319,12 @@ class CoHog:
 
     def _make_patterns(self, regions: Singles) -> Singles:
         """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `make_slow_patterns`)."""
-        return normalise_rows(regions @ make_slow_patterns(self.bins))
+        return gradients.normalise_rows(regions @ gradients.make_slow_patterns(self.bins))
 
     def _match_view(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
         if self._votes:  # with a nadir camera, landmarks are better evidence than the support of all regions
-            return match_view(view, reference, tuning.VOTE_WEIGHTS[self.camera], with_support=not self._is_nadir)
+            weight = tuning.VOTE_WEIGHTS[self.camera]
+            return displacement.match_view(view, reference, weight, with_support=not self._is_nadir)
         similarities = view.regions @ reference.T
         nearest = similarities.argmax(axis=1)
         score = np.clip(similarities[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0

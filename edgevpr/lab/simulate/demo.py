@@ -16,16 +16,8 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
+from edgevpr.lab.simulate import generated
 from edgevpr.lab.simulate.camera import light_scene, project_view
-from edgevpr.lab.simulate.generated import (
-    SCENE_DEPTH_M,
-    SCENE_WIDTH_M,
-    GeneratedFlight,
-    plan_later_flight,
-    plan_mapping_flight,
-    to_metres,
-    write_flight,
-)
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.review.logged import LoggedQuery, read_flight
 
@@ -60,10 +52,11 @@ def run_demo(folder: str | Path) -> str:
     first, second = folder / "flight-1", folder / "flight-2"
     for old_file in (*folder.glob("map.gpkg*"), log_path, picture_path):
         old_file.unlink(missing_ok=True)
-    scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
-    mapping, later = plan_mapping_flight(_SEED), replace(plan_later_flight(_SEED), interval_s=_INTERVAL_S)
+    scene = make_scene(_SEED, generated.SCENE_WIDTH_M, generated.SCENE_DEPTH_M)
+    mapping = generated.plan_mapping_flight(_SEED)
+    later = replace(generated.plan_later_flight(_SEED), interval_s=_INTERVAL_S)
     for out, flight, label in ((first, mapping, "flight 1, to map     "), (second, later, "flight 2, hours later")):
-        for _ in progress(write_flight(out, scene, flight), len(flight.poses), label):
+        for _ in progress(generated.write_flight(out, scene, flight), len(flight.poses), label):
             pass
     images = ("--images", first / "images", *_CAMERA)
     run_command("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
@@ -130,10 +123,10 @@ def _choose_colour(query: LoggedQuery) -> tuple[int, int, int]:
     return _CORRECT_COLOUR if is_correct(query) else _WRONG_COLOUR
 
 
-def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence[LoggedQuery]) -> None:
+def _draw(path: Path, ground: Image, mapping: generated.GeneratedFlight, queries: Sequence[LoggedQuery]) -> None:
     """Draw both tracks on the lit landscape `ground`, uint8 (H, W, 3) BGR, and write the picture to `path`. Unmapped
     land is darkened, and a line connects each query to its matched place."""
-    scale = _PICTURE_PX[0] / SCENE_WIDTH_M
+    scale = _PICTURE_PX[0] / generated.SCENE_WIDTH_M
 
     def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:
         return [(round(east * scale), round(_PICTURE_PX[1] - north * scale)) for east, north in np.asarray(points_m)]
@@ -146,8 +139,8 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
     picture = np.where(covered[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
     mapped_px = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
     matches = [query for query in queries if query.true_position and query.place_position]
-    query_px = pixels([to_metres(*query.true_position) for query in matches if query.true_position])
-    place_px = pixels([to_metres(*query.place_position) for query in matches if query.place_position])
+    query_px = pixels([generated.to_metres(*query.true_position) for query in matches if query.true_position])
+    place_px = pixels([generated.to_metres(*query.place_position) for query in matches if query.place_position])
     for track, colour in ((mapped_px, _MAPPED_COLOUR), (query_px, _LATER_COLOUR)):
         cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
     for place in mapped_px:

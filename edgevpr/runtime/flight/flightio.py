@@ -24,16 +24,8 @@ from edgevpr.mavlink.signing import Signing, open_signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.power.thermal import ThermalWatch
-from edgevpr.runtime.flight import systemd
+from edgevpr.runtime.flight import boundary, systemd
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
-from edgevpr.runtime.flight.boundary import (
-    RecordedDriver,
-    RecordedSource,
-    TapedStop,
-    TapedTurns,
-    tape_clock,
-    tape_machine,
-)
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.machine import Machine
@@ -143,15 +135,15 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
 
 def record_io(io: FlightIO, recording: Recording) -> FlightIO:
     """Return the same inputs and outputs, with all input recorded."""
-    turns = TapedTurns(io.clock.mono_s, recording)
+    turns = boundary.TapedTurns(io.clock.mono_s, recording)
     return replace(
         io,
-        clock=tape_clock(io.clock, recording),
-        machine=tape_machine(io.machine, recording),
-        open_source=lambda *how: RecordedSource(io.open_source(*how), recording, recording.store_frame),
+        clock=boundary.tape_clock(io.clock, recording),
+        machine=boundary.tape_machine(io.machine, recording),
+        open_source=lambda *how: boundary.RecordedSource(io.open_source(*how), recording, recording.store_frame),
         turns=turns,
-        drive=partial(RecordedDriver, turns),
-        stop=TapedStop(recording),
+        drive=partial(boundary.RecordedDriver, turns),
+        stop=boundary.TapedStop(recording),
     )
 
 

@@ -16,17 +16,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.appending import (
-    append_bytes,
-    delete_oldest,
-    is_same_file,
-    list_related,
-    open_appending,
-    rotate_file,
-    sync_file,
-    sync_folder,
-    try_lock,
-)
+from edgevpr.core import appending
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import format_json_line
 
@@ -95,7 +85,7 @@ class FlightLog(AbstractContextManager["FlightLog"]):
         Never raises OSError."""
         if self.path is None:
             return
-        if self._file is not None and not is_same_file(self._file, self._path):
+        if self._file is not None and not appending.is_same_file(self._file, self._path):
             self._warn(f"The flight log {self._path} was deleted or moved in flight; logging continues in a new file.")
             self._close_file()
         now_s, utc_s = self._clock(), self._utc_s()
@@ -151,34 +141,34 @@ class FlightLog(AbstractContextManager["FlightLog"]):
         if not size or (is_ours and size + more_bytes <= self._part_bytes):
             return file
         try:
-            rotate_file(self._path)
+            appending.rotate_file(self._path)
         except OSError as error:
             self._warn(
                 f"The flight log {self.path} cannot be rotated ({error.strerror}), so it grows and may "
                 "exceed log.max_mb: make its folder writable for the flight."
             )
             return file
-        sync_file(file)
+        appending.sync_file(file)
         self._close_file()
         if not math.isinf(self._part_bytes):
             with suppress(OSError):
-                delete_oldest(self._path, self._part_bytes * (_MAX_FILES - 1))
+                appending.delete_oldest(self._path, self._part_bytes * (_MAX_FILES - 1))
         return self._open()
 
     def _open(self) -> FileIO:
         """Open and lock the file. Raises OSError, also if another process has locked it."""
-        file = open_appending(self._path)
-        if not try_lock(file):
+        file = appending.open_appending(self._path)
+        if not appending.try_lock(file):
             file.close()
             raise OSError(errno.EBUSY, "another edgevpr process writes to it", str(self._path))
         self._file = file
         if not _read_size(file):  # on another disk, its device and inode may equal those of an earlier file
             self._own_identity = None
-            sync_folder(self._path)
+            appending.sync_folder(self._path)
         return file
 
     def _sync(self, file: FileIO, now_s: float) -> None:
-        sync_file(file)
+        appending.sync_file(file)
         self._is_synced, self._synced_s = True, now_s
 
     def _record_error(self, error: OSError) -> None:
@@ -210,7 +200,7 @@ def _append(file: FileIO, lines: bytes) -> None:
         file.seek(end - 1)
         if file.read(1) != b"\n":  # truncated by a power cut, or by a failure that could not be undone
             lines = b"\n" + lines
-    append_bytes(file, lines)
+    appending.append_bytes(file, lines)
 
 
 def _make_line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
@@ -288,7 +278,7 @@ def select_last_flight(path: str | Path) -> FlightLines:
     parts = {path: _find_parts(starts, flight)}
     if min(parts[path]) > 1:
         with suppress(OSError):
-            for other in list_related(path):
+            for other in appending.list_related(path):
                 with suppress(OSError):  # an unreadable file counts as missing
                     numbers = _find_parts(_read_starts(other), flight)
                     if numbers and min(numbers) < min(parts[path]):

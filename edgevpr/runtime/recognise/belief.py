@@ -20,13 +20,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Ints
-from edgevpr.runtime.recognise.gaussians import (
-    compute_distances,
-    compute_mean_sd,
-    fuse_positions,
-    mix_gaussians,
-    regularize_covariance,
-)
+from edgevpr.runtime.recognise import gaussians
 from edgevpr.runtime.recognise.hypotheses import (
     MIN_DIVISOR,
     Hypotheses,
@@ -100,7 +94,7 @@ class Belief:
         # As a product of matrices: ten times faster than differences with ten thousand places.
         squared = (places**2).sum(1) - 2 * position @ places.T
         distance = np.sqrt(np.maximum(squared.min(1) + (position**2).sum(1), 0))
-        self._now = self._now[np.flatnonzero(distance <= sight + compute_mean_sd(self._now.covariance))]
+        self._now = self._now[np.flatnonzero(distance <= sight + gaussians.compute_mean_sd(self._now.covariance))]
         self._lost = max(0.0, 1 - float(self._now.weight.sum()))
 
     def update(self, proposed: Proposals | None, motion: Motion, places: int) -> Posterior:
@@ -122,8 +116,8 @@ class Belief:
             lost *= likelihood
             # Repeated misses over the same ground are not new evidence either.
             misses = predict_misses(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
-            near = self._scale.near + _SAME_POSITION_SIGMAS * compute_mean_sd(misses.covariance)
-            is_near = compute_distances(proposed.position, misses.position) <= near
+            near = self._scale.near + _SAME_POSITION_SIGMAS * gaussians.compute_mean_sd(misses.covariance)
+            is_near = gaussians.compute_distances(proposed.position, misses.position) <= near
             predicted[indices] = is_near @ (now.weight * now.confirmed)
             # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
             min_gain = (factor * odds * lost - float(misses.weight.sum())) / max(float(hits.weight.sum()), _MIN_WEIGHT)
@@ -172,8 +166,10 @@ class Belief:
         # A picture of the same ground repeats the previous evidence. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         repeated, self._strongest = min(before, strongest), strongest
-        sd = np.sqrt(cov[:, 0, 0]) if scale.is_ordinal else compute_mean_sd(cov)
-        fresh = np.clip((compute_distances(now.anchor, position) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
+        sd = np.sqrt(cov[:, 0, 0]) if scale.is_ordinal else gaussians.compute_mean_sd(cov)
+        fresh = np.clip(
+            (gaussians.compute_distances(now.anchor, position) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1
+        )
         evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.weight[:, None])
         # For each motion, the weight (M, K) that each hypothesis gives each candidate.
         weights = [
@@ -191,12 +187,12 @@ class Belief:
         agreement = float(weight.sum()) * p_none / max(MIN_DIVISOR, expected)
         likelihood = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.weight) else 1.0
 
-        predicted_position, predicted_cov = mix_gaussians(
+        predicted_position, predicted_cov = gaussians.mix_gaussians(
             np.concatenate(weights).T / np.maximum(weight, MIN_DIVISOR)[:, None],
             np.concatenate([move.position for move in moves]),
             np.concatenate([move.covariance for move in moves]),
         )
-        fused_position, fused_cov = fuse_positions(position, cov, predicted_position, predicted_cov)
+        fused_position, fused_cov = gaussians.fuse_positions(position, cov, predicted_position, predicted_cov)
         gain = np.where(np.isnan(now.velocity[:, :1]), 1.0, _NEWEST_WEIGHT)
         kept = (1 - gain) * np.nan_to_num(now.velocity) - gain * now.position / elapsed_s
         velocity = (origin.T @ gain) * position / elapsed_s + origin.T @ kept
@@ -222,11 +218,11 @@ class Belief:
         now, posterior = self._now, Posterior(lost=self._lost, probability=probability, predicted=predicted)
         if not len(now.weight):
             return posterior
-        is_near = compute_distances(now.position, now.position) <= self._scale.near
+        is_near = gaussians.compute_distances(now.position, now.position) <= self._scale.near
         chosen = is_near[(is_near @ now.weight).argmax()]
         mass = float(now.weight[chosen].sum())
         weight = now.weight[chosen] / mass
-        (position,), (covariance,) = mix_gaussians(weight[None], now.position[chosen], now.covariance[chosen])
+        (position,), (covariance,) = gaussians.mix_gaussians(weight[None], now.position[chosen], now.covariance[chosen])
         north, east = (weight @ now.heading[chosen]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
         return replace(posterior, mass=mass, position=position, covariance=covariance, heading_deg=heading_deg)
@@ -243,7 +239,7 @@ def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposal
     return indices, Proposals(
         probability=probability / max(1.0, float(probability.sum())),
         position=proposed.position[indices],
-        covariance=regularize_covariance(proposed.covariance[indices], (_MIN_SD * scale.spacing) ** 2),
+        covariance=gaussians.regularize_covariance(proposed.covariance[indices], (_MIN_SD * scale.spacing) ** 2),
         heading_deg=proposed.heading_deg[indices],
         is_certain=proposed.is_certain[indices],
     )

@@ -12,14 +12,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, Mount, View, enlar
 from edgevpr.frames.mask import OverlayMask
 from edgevpr.frames.sameness import StripCheck
 from edgevpr.places.layers import Layers
-from edgevpr.runtime.recognise.landmarks import (
-    AHEAD_PX,
-    DOWN_PX,
-    PLACE_LANDMARKS,
-    Landmarks,
-    detect_landmarks,
-    pack_bytes,
-)
+from edgevpr.runtime.recognise import landmarks
 from edgevpr.runtime.recognise.levelling import Levelling, Undistortion
 from edgevpr.runtime.recognise.salience_gate import SalienceGate, SalienceVerdict
 
@@ -83,14 +76,14 @@ class FrameEncoder:
             descriptor = self.technique.encode(picture.image, picture.mask)
         return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, salience=salience, descriptor=descriptor)
 
-    def detect_landmarks(self, picture: LevelledImage, count: int = PLACE_LANDMARKS) -> Landmarks:
+    def detect_landmarks(self, picture: LevelledImage, count: int = landmarks.PLACE_LANDMARKS) -> landmarks.Landmarks:
         """Detect the `count` best landmarks of an image, scaled to the size used for the landmarks of places."""
-        longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
-        return detect_landmarks(picture.image, picture.mask, count, longest_px)
+        longest_px = landmarks.DOWN_PX if self.technique.spec.looks_down else landmarks.AHEAD_PX
+        return landmarks.detect_landmarks(picture.image, picture.mask, count, longest_px)
 
     def pack_landmarks(self, picture: LevelledImage) -> bytes | None:
         """Return the encoded landmarks to store for a place; None if the technique does not use them."""
-        return pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
+        return landmarks.pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
 
     def replace_mount(self, mount: Mount) -> "FrameEncoder":
         """Return this encoder with the camera mounted at the angles `mount` from straight down."""

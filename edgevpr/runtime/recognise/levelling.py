@@ -11,20 +11,8 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import move_position, picture_axes
 from edgevpr.core.types import Frame, Pose, Vehicle
+from edgevpr.frames import level
 from edgevpr.frames.lens import CalibratedLens, compute_lens_view, read_lens
-from edgevpr.frames.level import (
-    STRAIGHT_DOWN,
-    UNKNOWN_VIEW,
-    Lens,
-    LevelledImage,
-    Mount,
-    View,
-    compute_footprint,
-    enlarge_image,
-    estimate_tilted_view,
-    level_image,
-    undistort_frame,
-)
 from edgevpr.frames.source import is_live
 from edgevpr.places.layers import Layers
 from edgevpr.runtime.recognise.relief import compute_nadir_sd
@@ -49,14 +37,14 @@ class Levelling:
     level, unless the frame itself has other angles. `is_live` is False for recorded frames, for which the autopilot's
     reports do not apply."""
 
-    lens: Lens | None = field(kw_only=False)
+    lens: level.Lens | None = field(kw_only=False)
     below: bool = False
     is_on_gimbal: bool = False
     is_live: bool
-    mount: Mount = STRAIGHT_DOWN
+    mount: level.Mount = level.STRAIGHT_DOWN
     _has_warned: bool = field(default=False, init=False)
 
-    def replace_mount(self, mount: Mount) -> "Levelling":
+    def replace_mount(self, mount: level.Mount) -> "Levelling":
         """Return the same levelling for a camera with another `mount`."""
         return replace(self, lens=self.lens and replace(self.lens, mount=mount), mount=mount)
 
@@ -68,7 +56,7 @@ class Levelling:
         *,
         layers: Layers | None = None,
         scale: float = 1.0,
-    ) -> LevelledImage:
+    ) -> level.LevelledImage:
         """Level the image of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
         False where the image shows no ground (None: it shows ground everywhere). The image's longest side is scaled to
         the footprint of the places to search, chosen from their `layers` (None: no scaling). It shows `scale` times as
@@ -78,12 +66,13 @@ class Levelling:
         if self.is_on_gimbal and None in (frame.roll_deg, frame.pitch_deg):
             frame = replace(frame, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
-            return enlarge_image(
-                LevelledImage(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale
-            )
-        full_m = compute_footprint(frame, vehicle, self.lens) if layers else None
+            view = level.estimate_tilted_view(frame, vehicle, self.mount)
+            return level.enlarge_image(level.LevelledImage(frame.image, overlay, view), scale)
+        full_m = level.compute_footprint(frame, vehicle, self.lens) if layers else None
         footprint_m = layers.choose_footprint(full_m and scale * full_m) if layers else None
-        picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
+        picture = level.level_image(
+            frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale
+        )
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
             _log.warning("%s: %s (further frames are not reported)", frame.name, picture.view.reason)
@@ -96,9 +85,9 @@ class Undistortion:
 
     lens: CalibratedLens
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> LevelledImage:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> level.LevelledImage:
         """Undistort the image of a frame, which has no scale. Arguments as in `Levelling.prepare`."""
-        return undistort_frame(frame.image, overlay, UNKNOWN_VIEW, self.lens)
+        return level.undistort_frame(frame.image, overlay, level.UNKNOWN_VIEW, self.lens)
 
 
 def make_levelling(
@@ -117,16 +106,16 @@ def make_levelling(
     )
 
 
-def read_camera_lens(config: SourceConfig) -> Lens | None:
+def read_camera_lens(config: SourceConfig) -> level.Lens | None:
     """Return the lens of the configured camera; None if unknown. Raises the errors of `make_levelling`."""
     calibrated = load_calibrated_lens(config)
     fov_deg = compute_lens_view(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
-    return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated, read_mount(config))
+    return None if fov_deg is None else level.Lens(fov_deg, config.up_deg, calibrated, read_mount(config))
 
 
-def read_mount(config: SourceConfig) -> Mount:
+def read_mount(config: SourceConfig) -> level.Mount:
     """Return the mounting angles of the configured camera, relative to straight down."""
-    return Mount(config.mount_ahead_deg, config.mount_right_deg)
+    return level.Mount(config.mount_ahead_deg, config.mount_right_deg)
 
 
 def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
@@ -143,12 +132,12 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
     return lens
 
 
-def set_picture_heading(frame: Frame, view: View) -> Frame:
+def set_picture_heading(frame: Frame, view: level.View) -> Frame:
     """Return the frame with the heading of the top of its levelled image, if known. The hints use this heading."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
-def centre_place(frame: Frame, view: View) -> Frame:
+def centre_place(frame: Frame, view: level.View) -> Frame:
     """Convert a frame to the form stored for a place. Its heading becomes that of the levelled image. Its position,
     if any, becomes that of the image's centre instead of the aircraft, if that can be computed. With a known
     height and heading, a pose is added."""

@@ -6,8 +6,7 @@ from functools import partial
 import cv2
 import pytest
 
-from edgevpr.lab.simulate import demo
-from edgevpr.lab.simulate.generated import plan_later_flight, plan_mapping_flight
+from edgevpr.lab.simulate import demo, generated
 from edgevpr.lab.simulate.landscape import make_scene
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
@@ -16,8 +15,9 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 @pytest.fixture
 def coarse_scene(monkeypatch):
     monkeypatch.setattr(demo, "make_scene", partial(make_scene, metres_per_pixel=0.5))
-    for name, flight in (("plan_mapping_flight", plan_mapping_flight), ("plan_later_flight", plan_later_flight)):
-        monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
+    for name in ("plan_mapping_flight", "plan_later_flight"):
+        plan = getattr(generated, name)
+        monkeypatch.setattr(generated, name, lambda seed, plan=plan: replace(plan(seed), poses=plan(seed).poses[:6]))
 
 
 def test_run_demo_maps_flies_and_draws(coarse_scene, tmp_path):
