@@ -80,9 +80,8 @@ def run_eval(args: Namespace) -> int:
         raise next(iter(outcome.failed.values()))
     if len(sets) == 1:
         content["techniques"] = {row["row"]: row for row in content.pop("results")}
-    tables = [
-        f"{sanitize(name)}\n\n{format_results(results)}\n" for name, results in outcome.measured.items() if results
-    ]
+    measured = ((sanitize(name), results) for name, results in outcome.measured.items() if results)
+    tables = [f"{name}\n\n{format_results(results)}\n" for name, results in measured]
     shared.print_result(content, args.json, "\n".join(tables))
     shared.print_notes(*(f"{row} not evaluated on {name}: {error}" for (name, row), error in outcome.failed.items()))
     return 1 if outcome.failed else 0

@@ -67,9 +67,8 @@ def _run(argv: list[str]) -> int:
         return 1
     except OSError as error:
         prefix = f"{error.filename}: " if error.filename else ""
-        return _report_failure(
-            args, error, f"{prefix}{error.strerror or error}: check the path, its permissions and the disk.", 1
-        )
+        sentence = f"{prefix}{error.strerror or error}: check the path, its permissions and the disk."
+        return _report_failure(args, error, sentence, 1)
     except ImportError as error:
         return _report_failure(args, error, f"{error}: package missing or broken: reinstall edgevpr on a 64-bit OS.", 1)
     except KeyboardInterrupt:

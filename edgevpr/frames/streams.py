@@ -87,11 +87,7 @@ class StreamCapture(Capture):
     `opened_s` its time just before the opening. `delay_sd_s`: see `Shot`."""
 
     def __init__(
-        self,
-        decoder: VideoDecoder,
-        clock: Callable[[], float],
-        opened_s: float,
-        delay_sd_s: float = HIDDEN_DELAY_SD_S,
+        self, decoder: VideoDecoder, clock: Callable[[], float], opened_s: float, delay_sd_s: float = HIDDEN_DELAY_SD_S
     ) -> None:
         self._decoder, self._clock, self._delay_sd_s = decoder, clock, delay_sd_s
         self._stamped = StampedTime() if decoder.is_stamped else None

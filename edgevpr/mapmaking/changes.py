@@ -51,8 +51,7 @@ def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength
     matrix[1, 2] += rng.uniform(-0.15, 0.15) * height * strength * (1.0 if looks_down else 0.4)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved_corners = corners + (rng.uniform(-0.05, 0.05, (4, 2)) * (width, height) * strength).astype(np.float32)
-    warp: Doubles = cv2.getPerspectiveTransform(corners, moved_corners) @ np.vstack([matrix, (0, 0, 1)])
-    return warp
+    return np.asarray(cv2.getPerspectiveTransform(corners, moved_corners) @ np.vstack([matrix, (0, 0, 1)]))
 
 
 def _warp_image(image: Array, warp: Doubles, flags: int) -> Array:
@@ -67,8 +66,7 @@ def change_season(grey: Singles, rng: np.random.Generator, strength: float) -> S
     first, second = (_make_tone_curve(rng, strength)[tones] for _ in range(2))
     blend = np.clip(0.5 + _make_smooth_field(rng, (height, width), 6), 0, 1)
     texture = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), max(1.0, width / 200))
-    changed: Singles = blend * first + (1 - blend) * second + 0.36 * strength * texture
-    return changed
+    return np.asarray(blend * first + (1 - blend) * second + 0.36 * strength * texture)
 
 
 def _change_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:

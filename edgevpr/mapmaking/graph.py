@@ -159,8 +159,7 @@ class _Graph:
     def compute_tie_residuals(self) -> Floats:
         """Return the residual of each tie, in its standard deviations: float (T,)."""
         steps, turns = self._compute_residuals()
-        residuals: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
-        return residuals
+        return np.asarray(np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd))
 
     def _compute_residuals(self) -> tuple[Complexes, Complexes]:
         """Return the residuals of the ties in step and turn, complex (T,) each."""
@@ -261,8 +260,7 @@ def _invert_diagonal(normal: csc_matrix) -> Floats:
         if pending_children[column]:
             blocks[column] = block
         diagonal[column] = block[0, 0].real
-    original_order: Floats = diagonal[factored.perm_c]
-    return original_order
+    return np.asarray(diagonal[factored.perm_c])
 
 
 def _find_rows_below(lower: csc_matrix) -> list[Array]:

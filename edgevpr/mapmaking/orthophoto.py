@@ -181,8 +181,7 @@ class Orthophoto:
 
         Returns the picture, uint8 (side_px, side_px, 3) BGR, and bool (side_px, side_px), True where there is data.
         Pixels without data get the mean colour of the others. Raises ImageError if this part of the file is damaged."""
-        half_m = footprint_m / 2
-        corners = self._to_pixels(centre, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
+        corners = self._to_pixels(centre, footprint_m / 2 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
         if not np.isfinite(corners).all():
             return _make_blank(side_px)
         source_px = np.hypot(*(corners[1] - corners[0]))
@@ -197,9 +196,8 @@ class Orthophoto:
         # Warp to twice the size and average, so that no pixel of the file is skipped.
         large_px = 2 * side_px
         target = np.array([[0, 0], [large_px, 0], [large_px, large_px], [0, large_px]])
-        view = cv2.getPerspectiveTransform(
-            ((corners - low) / shrink - 0.5).astype(np.float32), (target - 0.5).astype(np.float32)
-        )
+        cut_px, target_px = (corners - low) / shrink - 0.5, target - 0.5
+        view = cv2.getPerspectiveTransform(cut_px.astype(np.float32), target_px.astype(np.float32))
         large = (large_px, large_px)
         warped = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
         picture = resize(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8

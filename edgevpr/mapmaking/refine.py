@@ -114,10 +114,7 @@ class Refinement:
 
 
 def refine(
-    place_map: PlaceMap,
-    technique: Technique,
-    progress: Progress,
-    images: str | Path | None = None,
+    place_map: PlaceMap, technique: Technique, progress: Progress, images: str | Path | None = None
 ) -> Refinement:
     """Refine a map that is open for writing, in one transaction. `progress` wraps the iteration over the pairs of
     places. `images` is the folder of the map's pictures (None: not available, so only the landmarks in the map are
@@ -127,9 +124,7 @@ def refine(
     located = [place for place in places if place.position]
     refinable = [place for place in located if not (place.pose and place.pose.is_surveyed)]
     result = Refinement(
-        places=len(places),
-        without_position=len(places) - len(located),
-        surveyed=len(located) - len(refinable),
+        places=len(places), without_position=len(places) - len(located), surveyed=len(located) - len(refinable)
     )
     if not refinable:
         return result
@@ -179,8 +174,7 @@ def refine(
 def _is_determined(solution: GraphSolution) -> Bools:
     """Return bool (N,), True for places in a large enough group whose solution is accurate enough for a pose."""
     group_size = np.bincount(solution.component)[solution.component]
-    is_determined: Bools = (group_size >= _MIN_GROUP) & (solution.log_var / 2 <= _MAX_LOG_SD**2)
-    return is_determined
+    return np.asarray((group_size >= _MIN_GROUP) & (solution.log_var / 2 <= _MAX_LOG_SD**2))
 
 
 def _is_mirrored(
@@ -275,11 +269,10 @@ def _find_overlapping_pairs(position: Complexes, log: Complexes, selected: Bools
     """Return the pairs of places that overlap in a solved graph. `position` and `log` are those of
     `graph.GraphSolution`; only places where `selected`, bool (N,), is True are considered."""
     members, footprint_m = np.flatnonzero(selected), np.exp(log.real[selected])
-    pairs = _pair_nearest(position[members], _MAX_OVERLAPPING)
     return sorted(
         {
             (int(members[later]), int(members[earlier]))
-            for later, earlier, distance_m in pairs
+            for later, earlier, distance_m in _pair_nearest(position[members], _MAX_OVERLAPPING)
             if distance_m <= _MAX_OVERLAP_DISTANCE * min(footprint_m[later], footprint_m[earlier])
         }
     )
@@ -334,8 +327,7 @@ def _make_comparer(
         pose = None if first is None or second is None else measure_agreement(first, second, expected)
         if pose is None or pose.inliers < min_inliers or pose.shift_share is None or pose.rotation_deg is None:
             return None
-        overlay = Overlay(pose.shift_share, pose.rotation_deg, pose.scale)
-        return Tie(*overlay.relative_pose, *_LANDMARK_SDS)
+        return Tie(*Overlay(pose.shift_share, pose.rotation_deg, pose.scale).relative_pose, *_LANDMARK_SDS)
 
     def compare_pair(query: int, place: int) -> Tie | None:
         if tie := compare_landmarks(query, place, None, MIN_PROVEN_INLIERS):

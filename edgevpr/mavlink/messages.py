@@ -262,9 +262,8 @@ def make_parameter_request(target_system: int, name: str) -> Message:
 
 def make_origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> Message:
     """Make a SET_GPS_GLOBAL_ORIGIN (48): the origin of the autopilot's local frame, `alt_m` above sea level."""
-    return mavlink.MAVLink_set_gps_global_origin_message(
-        target_system, round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3)
-    )
+    position = round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3)
+    return mavlink.MAVLink_set_gps_global_origin_message(target_system, *position)
 
 
 def make_named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]:
@@ -319,10 +318,7 @@ def make_status_text(severity: Severity, text: str) -> Message:
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
-_GPS_REPORTS_HZ = {
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5,
-    mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5,
-}
+_GPS_REPORTS_HZ = {mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5, mavlink.MAVLINK_MSG_ID_GPS2_RAW: 5}
 _REPORTS_HZ = _GPS_REPORTS_HZ | {
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 10,

@@ -19,14 +19,7 @@ from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Fusion
 from edgevpr.mavlink.receivers import GPS_REPORTS, GPS_TIMEOUT_S, Receivers
-from edgevpr.mavlink.vehicle import (
-    HISTORY_S,
-    MAX_FILTER_REPORT_AGE_S,
-    Attitude,
-    Attitudes,
-    PositionAccuracy,
-    Readiness,
-)
+from edgevpr.mavlink.vehicle import HISTORY_S, MAX_FILTER_REPORT_AGE_S, Attitude, Attitudes, PositionAccuracy, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
 MAX_GPS_DISAGREEMENT_M = 50.0  # at 25 m/s, with one or two seconds between the two reports

@@ -56,9 +56,8 @@ def make_map_page(
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
     steps = list(_make_steps(places, mean_confidences, tags_off_m, twins, points))
     pairs = [(points.get(twin.place_id), points.get(twin.other_id)) for twin in twins.values()]
-    tags = [
-        (to_point(place.recorded_position), points[place.place_id]) for place in ground if place.place_id in tags_off_m
-    ]
+    tagged = [place for place in ground if place.place_id in tags_off_m]
+    tags = [(to_point(place.recorded_position), points[place.place_id]) for place in tagged]
     layers = [
         Layer("coverage gaps", "gap", gaps, "area"),
         Layer("look alike", "alike", [(point, other) for point, other in pairs if point and other], "line"),

@@ -54,8 +54,7 @@ def stretch_contrast(
     picture -= np.float32(low)
     picture *= np.float32(gain)
     picture += np.float32(min(low, 255 - target_levels))
-    clipped: Singles = np.clip(picture, 0, 255, out=picture)
-    return clipped
+    return np.asarray(np.clip(picture, 0, 255, out=picture))
 
 
 def _find_range(grey: Singles, allowed: Mask | None) -> tuple[float, float]:

@@ -46,8 +46,7 @@ def average_blocks(per_pixel: Array, cell_px: int) -> Array:
     float32 (H, W) to (H/cell_px - 1, W/cell_px - 1)."""
     height, width = per_pixel.shape
     cells = cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
-    means: Array = (cells[:-1, :-1] + cells[:-1, 1:] + cells[1:, :-1] + cells[1:, 1:]) / 4
-    return means
+    return np.asarray((cells[:-1, :-1] + cells[:-1, 1:] + cells[1:, :-1] + cells[1:, 1:]) / 4)
 
 
 def find_good_blocks(grey: Bytes, kind: str, cell_px: int, threshold: float, eligible: Bools | bool = True) -> Bools:
@@ -93,16 +92,14 @@ def _make_block_matrix(side_px: int, cell_px: int) -> Singles:
     enlargement = cv2.resize(unit, (SHANNON_SIDE_PX, side_px), interpolation=cv2.INTER_LINEAR)
     cells = side_px // cell_px
     pairs = np.eye(cells - 1, cells, dtype=np.float32) + np.eye(cells - 1, cells, 1, dtype=np.float32)
-    matrix: Singles = (pairs / 2) @ enlargement.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1)
-    return matrix
+    return np.asarray((pairs / 2) @ enlargement.reshape(-1, cell_px, SHANNON_SIDE_PX).mean(axis=1))
 
 
 def _count_distinct(padded: Array) -> Array:
     """Count the distinct intensities in each disc by unions of 256-bit sets; for shapes see `_combine_over_disc`."""
     bit, word_index = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
     unions = (_combine_over_disc(bit * (word_index == word), np.bitwise_or) for word in range(4))
-    sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
-    return sizes
+    return np.asarray(reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions)))
 
 
 def _compute_shannon_map(small: Array) -> Singles:
@@ -115,8 +112,7 @@ def _compute_shannon_map(small: Array) -> Singles:
         sums += _COUNT_LOG2.take(_combine_over_disc(one_hot, np.add)).sum(axis=0)
     in_disc = _combine_over_disc((padded >= 0).view(np.uint8), np.add)
     # -sum p log2 p with p = c/n is log2 n - (sum c log2 c)/n.
-    entropy: Singles = (_COUNT_LOG2[in_disc] - sums) / in_disc / 8
-    return entropy
+    return np.asarray((_COUNT_LOG2[in_disc] - sums) / in_disc / 8)
 
 
 def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:

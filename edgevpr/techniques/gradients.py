@@ -157,8 +157,7 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     sum_plane(7, diagonal, sign_x ^ sign_y)
     cell_sums = np.add.reduce(sums.reshape(8, 1, -1, cell_px), axis=3)
     votes = np.add.reduce(cell_sums * _ORIENTATIONS[:, :, None], axis=0)
-    oriented: Singles = np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8)
-    return oriented
+    return np.asarray(np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8))
 
 
 def _compute_magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
@@ -179,8 +178,7 @@ def normalise_blocks(cells: Singles) -> Singles:
 
 def normalise_rows(rows: Singles) -> Singles:
     """Scale each row of (N, D) to length 1; a zero row stays zero."""
-    unit: Singles = rows / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-6)[:, None]
-    return unit
+    return np.asarray(rows / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-6)[:, None])
 
 
 @lru_cache
@@ -207,8 +205,7 @@ def make_waves(bins: int) -> Singles:
     angle = 2 * np.pi * np.arange(bins) / bins
     frequency, row = _list_frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * angle - np.pi / 2 * (row[:, None] % 2 == 0) * (row[:, None] > 0))
-    unit: Singles = (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
-    return unit
+    return np.asarray((series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32))
 
 
 def _list_frequencies(bins: int) -> Ints:

@@ -73,8 +73,7 @@ def make_field(grid: Grid, patterns: Array, indices: Ints, sides: tuple[int, int
     surround = _make_distance_weights(len(weight), _SURROUND_SD * grid.side)
     values -= weight * _apply_weights(surround, values) / np.maximum(_apply_weights(surround, weight), _TINY)
     values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _MIN_STRENGTH))
-    field: Array = values * (weight > _MIN_SEEN_FRACTION)
-    return field
+    return np.asarray(values * (weight > _MIN_SEEN_FRACTION))
 
 
 def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
@@ -85,12 +84,10 @@ def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
     for grid in (COARSE, FINE):
         values = make_field(grid, patterns[indices], indices, (side, side)).ravel()
         largest = max(float(np.percentile(np.abs(values), _LEVEL_PERCENTILE)), _TINY)
-        levels = np.clip(np.rint(values * (_MAX_LEVEL / largest)), -_MAX_LEVEL, _MAX_LEVEL).astype(np.uint8) + (
-            _MAX_LEVEL + 1
-        )
+        clipped = np.clip(np.rint(values * (_MAX_LEVEL / largest)), -_MAX_LEVEL, _MAX_LEVEL)
+        levels = clipped.astype(np.uint8) + (_MAX_LEVEL + 1)
         stored.append(levels[::2] | levels[1::2] << 4)
-    packed: Bytes = np.concatenate(stored).astype(np.uint8)
-    return packed
+    return np.asarray(np.concatenate(stored).astype(np.uint8))
 
 
 def scan_places(fields: Fields, rows: Bytes, rotation_deg: Doubles | None, likely: Bools | None) -> Singles:
@@ -209,19 +206,16 @@ def _make_pooling(side: int, place_side: int, cells: int) -> Singles:
     starts = (np.arange(m)[:, None] - m / 2) * pitch
     region = np.arange(side) - side / 2
     overlap = np.minimum(starts + pitch, region + 1) - np.maximum(starts, region)
-    weights: Singles = (overlap.clip(0) / pitch).astype(np.float32)
-    return weights
+    return np.asarray((overlap.clip(0) / pitch).astype(np.float32))
 
 
 @lru_cache
 def _make_distance_weights(cells: int, sd: float) -> Singles:
     """Return Gaussian weights of the distances between the cells of a row, float32 (cells, cells)."""
     distance = np.subtract.outer(np.arange(cells), np.arange(cells))
-    weights: Singles = np.exp(-(distance**2) / (2 * sd**2)).astype(np.float32)
-    return weights
+    return np.asarray(np.exp(-(distance**2) / (2 * sd**2)).astype(np.float32))
 
 
 def _apply_weights(weights: Singles, values: Array) -> Array:
     """Apply `weights` (m, n) along both sides of `values` (..., n, n): (..., m, m)."""
-    summed: Array = weights @ values @ weights.T
-    return summed
+    return np.asarray(weights @ values @ weights.T)

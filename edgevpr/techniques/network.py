@@ -141,8 +141,7 @@ def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -
 
     def head(features: Singles) -> Singles:
         pooled = pool_pyramid(features, levels)
-        normalised: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
-        return normalised
+        return np.asarray(pooled / max(float(np.abs(pooled).sum()), 1e-6))
 
     backbone, parameters = open_backbone(model, "features", threads), {"model": model, "levels": levels}
     return NetworkVector(name, backbone, head, parameters=parameters, form=form, similarity="l1")

@@ -45,8 +45,7 @@ def compute_structure(patterns: Array, seen: Bools, sd_cells: float) -> Singles:
     mean = _blur_cells(values, sd_cells) / np.maximum(_blur_cells(weight, sd_cells), _TINY)[..., None]
     values -= mean * weight[..., None]
     strength = np.sqrt((values**2).sum(axis=2))
-    structure: Singles = values / np.sqrt(np.maximum(strength, _MIN_STRENGTH))[..., None]
-    return structure
+    return np.asarray(values / np.sqrt(np.maximum(strength, _MIN_STRENGTH))[..., None])
 
 
 def measure_prominence(query: Singles, place: Singles) -> float:

@@ -43,8 +43,7 @@ def make_grid(blocks: Singles, seen: Bools, used: Bools) -> tuple[Singles, Bools
 def compute_deviations(grids: Floats, mean: Floats) -> Array:
     """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L) and write the orientations of each cell as a
     Fourier series: float32 of the shape of `grids`."""
-    deviations: Array = (np.asarray(grids, np.float32) - mean) @ make_waves(grids.shape[-1]).T
-    return deviations
+    return np.asarray((np.asarray(grids, np.float32) - mean) @ make_waves(grids.shape[-1]).T)
 
 
 def pack_grids(grids: Floats, mean: Floats) -> Bytes:
@@ -98,8 +97,7 @@ def _make_blur_weights() -> Singles:
     mean around the e-th of the E shifts with even dx and dy."""
     even = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(even[:, None] - SHIFTS) / 2, 0).prod(axis=2)
-    weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    return weights
+    return np.asarray((weight / weight.sum(axis=1, keepdims=True)).astype(np.float32))
 
 
 @lru_cache(maxsize=8)

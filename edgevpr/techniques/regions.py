@@ -170,8 +170,7 @@ def describe_regions(features: Singles, boxes: Ints) -> Singles:
     np.cumsum(sums, axis=1, out=sums)
     top, left, bottom, right = boxes.T
     box_sums = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    regions: Singles = normalise_rows(box_sums).astype(np.float32)
-    return regions
+    return np.asarray(normalise_rows(box_sums).astype(np.float32))
 
 
 def score_mutual_pairs(query: Singles, place: Singles) -> float:
@@ -191,11 +190,9 @@ def score_mutual_pairs(query: Singles, place: Singles) -> float:
 def to_bytes(vectors: Singles) -> Array:
     """Quantise directions to 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest magnitude."""
     largest = np.maximum(np.abs(vectors).max(axis=1, keepdims=True), _TINY)
-    stored: Array = np.rint(127 / largest * vectors).astype(np.int8)
-    return stored
+    return np.asarray(np.rint(127 / largest * vectors).astype(np.int8))
 
 
 def from_bytes(stored: Array) -> Singles:
     """Restore the rows of `to_bytes`, L2-normalised: int8 (N, D) to float32 (N, D); a zero row stays zero."""
-    vectors: Singles = normalise_rows(stored.astype(np.float32))
-    return vectors
+    return np.asarray(normalise_rows(stored.astype(np.float32)))

@@ -95,5 +95,4 @@ def enhance_contrast(differences: Array) -> Doubles:
     total = sums[last] - sums[first]
     variance = (count * (squares[last] - squares[first]) - total**2).astype(np.float64)  # times count * (count - 1)
     scale = np.sqrt((count - 1) / count / np.maximum(variance, 1))  # a variance of 0 leaves nothing to scale
-    deviations: Doubles = (count * integers - total) * scale
-    return deviations
+    return np.asarray((count * integers - total) * scale)

@@ -45,8 +45,7 @@ def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
 
 def normalise_rows(vectors: Array) -> Array:
     """Scale rows (or a single vector) to length 1; a zero vector stays zero."""
-    unit_vectors: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
-    return unit_vectors
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY))
 
 
 def make_local_descriptors(features: Singles) -> Singles:
@@ -97,11 +96,9 @@ def compute_bag_of_words(local: Singles, words: Singles) -> Singles:
 
 def find_nearest(local: Singles, words: Singles) -> Ints:
     """Return the index of the word nearest to each descriptor, the first one in a tie: (N, D), (K, D) to int (N,)."""
-    indices: Ints = _compute_closeness(local, words).argmax(axis=1)
-    return indices
+    return np.asarray(_compute_closeness(local, words).argmax(axis=1))
 
 
 def _compute_closeness(local: Singles, words: Singles) -> Singles:
     """Compute -|x - c|^2, plus a constant for each descriptor x: (N, D) and words (K, D) to float32 (N, K)."""
-    closeness: Singles = 2 * local @ words.T - np.einsum("kd,kd->k", words, words)
-    return closeness
+    return np.asarray(2 * local @ words.T - np.einsum("kd,kd->k", words, words))

@@ -29,8 +29,7 @@ def read_ardupilot(path: Path) -> Record:
     """Read a DataFlash log: POS (the autopilot's estimate) or, without it, GPS; ATT; CAM or, without it, TRIG."""
     from pymavlink import DFReader
 
-    is_text = path.suffix.lower() == ".log"
-    open_log = DFReader.DFReader_text if is_text else DFReader.DFReader_binary
+    open_log = DFReader.DFReader_text if path.suffix.lower() == ".log" else DFReader.DFReader_binary
     lines: dict[str, list[tuple[float, GeoTag]]] = {"POS": [], "GPS": [], "CAM": [], "TRIG": []}
     attitude: Attitude | None = None
     for message in _read_messages(open_log, path, [*lines, "ATT"]):
@@ -70,9 +69,8 @@ def read_telemetry(path: Path) -> Record:
             shots.append(replace(tag, t_utc_s=message._timestamp))
         else:
             heading = attitude or (None if message.hdg == _NO_HEADING else (message.hdg / 100, None, None))
-            tag = make_tag(
-                message.lat / 1e7, message.lon / 1e7, message.alt / 1000, heading, message.relative_alt / 1000
-            )
+            position = message.lat / 1e7, message.lon / 1e7, message.alt / 1000
+            tag = make_tag(*position, heading, message.relative_alt / 1000)
             lines.append((message._timestamp, tag))
     return Record(kind="telemetry log", track=make_track(path, lines), shots=tuple(shots))
 

@@ -37,8 +37,7 @@ def match_triggers(shots: Sequence[GeoTag], exif_tags: Mapping[str, GeoTag]) -> 
     names = [list(exif_tags)[index] for index in order]
     image_times_s, trigger_order = image_times_s[order], np.argsort(trigger_times_s, kind="stable")
     trigger_times_s, shots = trigger_times_s[trigger_order], [shots[index] for index in trigger_order]
-    is_whole = not np.any(image_times_s % 1)
-    tolerance_s = _WHOLE_SECONDS_TOLERANCE_S if is_whole else _FRACTIONS_TOLERANCE_S
+    tolerance_s = _FRACTIONS_TOLERANCE_S if np.any(image_times_s % 1) else _WHOLE_SECONDS_TOLERANCE_S
     if len(shots) == len(names):
         difference_s = trigger_times_s - image_times_s
         if np.abs(difference_s - np.median(difference_s)).max() <= tolerance_s:

@@ -138,10 +138,7 @@ def answer_queries(
 
 @contextmanager
 def open_temporary_map(
-    frames: Iterable[Frame],
-    technique: Technique,
-    images: Path | None = None,
-    progress: Progress = iterate_silently,
+    frames: Iterable[Frame], technique: Technique, images: Path | None = None, progress: Progress = iterate_silently
 ) -> Iterator[tuple[PlaceMap, PlaceIndex, tuple[str, ...]]]:
     """Context manager: map `frames` in a temporary file, then refine and calibrate the map like `map build`. Yields the
     map, open for reading, an index of all its places, and a sentence for each step that failed. `images` is the folder

@@ -25,12 +25,6 @@ def read_versions() -> dict[str, str | None]:
     return versions
 
 
-def describe_machine() -> dict[str, Any]:
-    """Return the processor, the number of cores this process may use, and the threads of NumPy's BLAS library."""
-    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
-    return {"cpu": read_cpu_model(), "cores": len(os.sched_getaffinity(0)), "blas_threads": threads}
-
-
 @cache
 def read_cpu_model() -> str:
     """Return the name of the processor, or its architecture (such as aarch64) if the system reports no name."""
@@ -41,6 +35,8 @@ def read_cpu_model() -> str:
 
 
 def describe_origin() -> dict[str, Any]:
-    """Return the date in UTC (like 2026-01-31), the machine and the versions to store with a result."""
-    today = datetime.now(timezone.utc).date()
-    return {"date": today.isoformat(), "machine": describe_machine(), "versions": read_versions()}
+    """Return the date in UTC (like 2026-01-31), the machine and the versions to store with a result. The machine: its
+    processor, the number of cores this process may use, and the threads of NumPy's BLAS library."""
+    today, threads = datetime.now(timezone.utc).date(), os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    machine = {"cpu": read_cpu_model(), "cores": len(os.sched_getaffinity(0)), "blas_threads": threads}
+    return {"date": today.isoformat(), "machine": machine, "versions": read_versions()}

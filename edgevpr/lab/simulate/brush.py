@@ -87,8 +87,7 @@ def make_noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float
 def mix_colours(low: tuple[int, int, int], high: tuple[int, int, int], weight: Array) -> Array:
     """Blend two colours by `weight` (H, W), 0 for `low` and 1 for `high`: float32 (H, W, 3)."""
     first, last = np.asarray(low, np.float32), np.asarray(high, np.float32)
-    mixed: Array = first + weight[..., None] * (last - first)
-    return mixed
+    return np.asarray(first + weight[..., None] * (last - first))
 
 
 def smooth_step(values: Array, low: float, high: float) -> Array:
@@ -119,8 +118,7 @@ def make_crown(rng: np.random.Generator, radius_px: int) -> Singles:
     lumps = make_noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
     leaves = make_noise(rng, (len(axis), len(axis)), 2.5, 2)
     dome = 1 - (axis[None] ** 2 + axis[:, None] ** 2) * (1.2 + 0.2 * lumps + 0.12 * leaves)
-    ragged: Singles = np.sqrt(np.clip(dome, 0, 1)) * np.clip(1 + 0.08 * lumps + 0.06 * leaves, 0, 1.2)
-    return ragged
+    return np.asarray(np.sqrt(np.clip(dome, 0, 1)) * np.clip(1 + 0.08 * lumps + 0.06 * leaves, 0, 1.2))
 
 
 def paint_tree(canvas: Scene, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
@@ -149,8 +147,7 @@ def make_winding(
     along = (end_m - start_m) / np.linalg.norm(end_m - start_m)
     t = np.linspace(0, 1, 200)[:, None]
     swing = sum(swing_m / wave * np.sin(2 * np.pi * (wave * t + rng.random())) for wave in (0.9, 1.8, 3.2))
-    line_m: Doubles = start_m + t * (end_m - start_m) + swing * np.array([-along[1], along[0]])
-    return line_m
+    return np.asarray(start_m + t * (end_m - start_m) + swing * np.array([-along[1], along[0]]))
 
 
 def cut_parcels(
@@ -180,8 +177,7 @@ def cut_parcels(
 def find_longest_side(polygon: Doubles) -> Doubles:
     """Return the longest side of a polygon (N, 2) as a vector (2,)."""
     sides = np.roll(polygon, -1, axis=0) - polygon
-    longest: Doubles = sides[np.argmax(np.hypot(*sides.T))]
-    return longest
+    return np.asarray(sides[np.argmax(np.hypot(*sides.T))])
 
 
 class LineBender:
@@ -204,8 +200,7 @@ class LineBender:
         shift = self._shift_m
         upper = shift[i, j] * (1 - dj) + shift[i, j + 1] * dj
         lower = shift[i + 1, j] * (1 - dj) + shift[i + 1, j + 1] * dj
-        bent_m: Doubles = line_m + upper * (1 - di) + lower * di
-        return bent_m
+        return np.asarray(line_m + upper * (1 - di) + lower * di)
 
 
 def _cut(piece: Doubles, point: Doubles, normal: Doubles) -> tuple[list[Doubles], Doubles]:

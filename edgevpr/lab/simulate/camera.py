@@ -65,8 +65,7 @@ def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
     pixel_from_lens = np.array(
         [[camera.focal_px, 0, (camera.width - 1) / 2], [0, camera.focal_px, (camera.height - 1) / 2], [0, 0, 1]]
     )
-    pixel_from_ground: Doubles = pixel_from_lens @ lens_from_body @ body_from_ned @ ned_from_ground
-    return pixel_from_ground
+    return np.asarray(pixel_from_lens @ lens_from_body @ body_from_ned @ ned_from_ground)
 
 
 def light_scene(scene: Scene, light: Light, seed: int) -> Image:

@@ -101,9 +101,8 @@ class Governor:
         if reading.rss_mb <= _MAX_HEADROOM_MEMORY * max_mb:
             self._reported.discard("memory")
         if full_s >= _MIN_EXCEEDED_S and "memory" not in self._reported:
-            return self._report_limit(
-                "memory", Reason(ReasonCode.MEMORY_OVER_LIMIT, {"used_mb": reading.rss_mb, "max_mb": max_mb})
-            )
+            why = Reason(ReasonCode.MEMORY_OVER_LIMIT, {"used_mb": reading.rss_mb, "max_mb": max_mb})
+            return self._report_limit("memory", why)
         is_cooling = is_hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S
         if exceeded is not None and exceeded_s >= _MIN_EXCEEDED_S and not is_cooling:
             if is_hot:

@@ -210,9 +210,8 @@ def fit_samples(samples: list[SurveySample]) -> tuple[Doubles, Doubles, Bools]:
     """
     jacobian = np.array([sample.jacobian for sample in samples])
     offset_m = np.array([sample.offset_m for sample in samples])
-    independent_m2, correlated_m2, correlation = np.array(
-        [(sample.independent_m2, sample.correlated_m2, sample.correlation) for sample in samples]
-    ).T
+    variances = [(sample.independent_m2, sample.correlated_m2, sample.correlation) for sample in samples]
+    independent_m2, correlated_m2, correlation = np.array(variances).T
     inlier_weights, scatter = np.ones(len(samples)), 1.0
     for iteration in range(_HUBER_ITERATIONS + _REJECTION_ITERATIONS):
         weight = inlier_weights / (independent_m2 + correlation * correlated_m2)

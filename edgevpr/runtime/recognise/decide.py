@@ -309,9 +309,8 @@ class Decider:
             return None
         with self.meter.step("compare"):
             fine, _ = self.place_map.read_fine_part(best.place.place_id)
-            return evidence.agree - log_share(
-                compute_share(self.technique.match_rotated(query.descriptor, fine, best.match))
-            )
+            rotated = self.technique.match_rotated(query.descriptor, fine, best.match)
+            return evidence.agree - log_share(compute_share(rotated))
 
     def _measure_perspective(self, best: Candidate, query: EncodedFrame) -> Perspective | None:
         """Measure the perspective of the query over the place; None if too few regions agree."""

@@ -59,9 +59,8 @@ def prepare_crops(image: Image, rule: InputRule) -> Singles:
     """Cut an image, uint8 (H, W[, 3]) of at least 5x5 pixels, into crops, row by row, and prepare them for a network:
     float32 (25, C, height, width)."""
     rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])
-    return np.concatenate(
-        [prepare_input(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns]
-    )
+    crops = (image[y[0] : y[-1] + 1, x[0] : x[-1] + 1] for y in rows for x in columns)
+    return np.concatenate([prepare_input(crop, rule) for crop in crops])
 
 
 def interpolate_map(matrix: Singles, size_px: tuple[int, int]) -> Singles:

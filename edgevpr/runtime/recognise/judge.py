@@ -247,9 +247,8 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed, reported = rule.confidence(evidence), rule.threshold(evidence), rule.cap_confidence(evidence)
-    reported_track = None if track is None else rule.cap_confidence(evidence, track)
     figures = {
-        "track_confidence": reported_track,
+        "track_confidence": None if track is None else rule.cap_confidence(evidence, track),
         "confidence": reported,
         "min_confidence": needed,
         **evidence.describe(),

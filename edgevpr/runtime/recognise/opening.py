@@ -73,13 +73,12 @@ def open_recogniser(
             place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
         rule = make_accept_rule(technique, match, length, read_calibration_for(place_map))
         candidates, min_accuracy_m = match.candidates or technique.candidates, config.mavlink.min_accuracy_m
-        settings = MatchSettings(candidates=candidates, min_accuracy_m=min_accuracy_m)
         recogniser = Recogniser(
             FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
             place_map,
             Matcher(index, rule, make_sequence_search(length)),
             meter or QueryMeter(board, config.battery),
-            settings=settings,
+            settings=MatchSettings(candidates=candidates, min_accuracy_m=min_accuracy_m),
             odometry=VisualOdometry() if uses_hints and knows_scale else None,
             # In a sequence, a place that a wrong hint excluded from one query would count as compared and dissimilar.
             prior=prior if length == 1 else None,

@@ -75,10 +75,9 @@ class _MapGeometry:
             self.footprint_m = max(layers.footprints_m, default=None)
             spacing_m, footprint_m = index.spacing_m() or 0.0, layers.median_m
             self.spread = max(_MIN_SPACING_M, spacing_m)
-            near_m = _NEAR_FOOTPRINT * footprint_m if footprint_m else self.spread
             self.scale = MapScale(
                 spacing=max(_MIN_SPACING_M, footprint_m / 2 if footprint_m else spacing_m),
-                near=max(_MIN_SPACING_M, near_m),
+                near=max(_MIN_SPACING_M, _NEAR_FOOTPRINT * footprint_m if footprint_m else self.spread),
             )
 
     def find_sight_m(self, view: View) -> float | None:

@@ -57,14 +57,12 @@ def explain_silence(address: LinkAddress, link: RequestLink) -> Finding:
     url = str(address)
     if refused := link.signing.refused:
         cause = max(refused, key=lambda reason: refused[reason])
-        return report_fault(
-            "link", FindingCode.MESSAGES_REFUSED, address=url, cause=cause, meaning=REFUSAL_MEANINGS[cause]
-        )
+        meaning = REFUSAL_MEANINGS[cause]
+        return report_fault("link", FindingCode.MESSAGES_REFUSED, address=url, cause=cause, meaning=meaning)
     if link.other_systems:
         change = f"mavlink: {{system_id: {min(link.other_systems)}}}"
-        return report_fault(
-            "link", FindingCode.OTHER_SYSTEM, change, address=url, systems=_join_numbers(sorted(link.other_systems))
-        )
+        systems = _join_numbers(sorted(link.other_systems))
+        return report_fault("link", FindingCode.OTHER_SYSTEM, change, address=url, systems=systems)
     if address.kind != "serial":
         return report_fault("link", FindingCode.NO_HEARTBEAT, address=url, waited_s=HEARTBEAT_TIMEOUT_S)
     code = FindingCode.SERIAL_NOT_MAVLINK if link.reader.bad_bytes else FindingCode.SERIAL_SILENT
@@ -79,9 +77,8 @@ def check_autopilot(reading: AutopilotReading, address: LinkAddress, sends_fixes
     yield _check_signing(reading)
     if reading.other_systems:
         change = f"mavlink: {{system_id: {reading.system_id}}}"
-        yield report_fault(
-            "vehicles", FindingCode.SYSTEM_NOT_NAMED, change, systems=_join_numbers(reading.other_systems)
-        )
+        systems = _join_numbers(reading.other_systems)
+        yield report_fault("vehicles", FindingCode.SYSTEM_NOT_NAMED, change, systems=systems)
     if reading.firmware not in RULES and sends_fixes:
         yield report_fault("firmware", FindingCode.FIRMWARE_UNTESTED, "mavlink: {send_fixes: false}")
     elif reading.firmware not in RULES:
@@ -147,9 +144,8 @@ def _check_state(reading: AutopilotReading) -> Iterator[Finding]:
     if reading.clock_ahead_s is None:
         yield report_ok("clock", FindingCode.CLOCK_NOT_COMPARED)
     elif abs(reading.clock_ahead_s) > _MAX_CLOCK_DIFFERENCE_S:
-        yield report_fault(
-            "clock", FindingCode.CLOCK_DIFFERS, "timedatectl set-ntp true", ahead_s=reading.clock_ahead_s
-        )
+        change = "timedatectl set-ntp true"
+        yield report_fault("clock", FindingCode.CLOCK_DIFFERS, change, ahead_s=reading.clock_ahead_s)
     else:
         yield report_ok("clock", FindingCode.CLOCK_AGREES, ahead_s=reading.clock_ahead_s)
 

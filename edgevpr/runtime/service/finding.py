@@ -104,9 +104,8 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
         return report_fault(what, FindingCode.PORT_IS_CONSOLE, disable_login, path=path, console=console)
     program, is_login = _find_program(port, root)
     if program:
-        return report_fault(
-            what, FindingCode.DEVICE_IN_USE, *([disable_login] if is_login else []), path=path, program=program
-        )
+        changes = [disable_login] if is_login else []
+        return report_fault(what, FindingCode.DEVICE_IN_USE, *changes, path=path, program=program)
     group = str(status.st_gid)
     with suppress(KeyError):
         group = grp.getgrgid(status.st_gid).gr_name

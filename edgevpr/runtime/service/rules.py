@@ -86,9 +86,8 @@ def _report_dry_run(choice: ChannelChoice, reading: AutopilotReading) -> Finding
     if choice.channel is Channel.GPS_INPUT:
         name = resolve_name(reading.parameters, RECEIVERS[choice.receiver])
         change = f"{name}={0 if choice.receiver == ADVISED_RECEIVER else 1}"
-    return report_fault(
-        "channel", FindingCode.DRY_RUN_NOT_ARMED, change, channel=choice.channel.name, vehicle=reading.vehicle
-    )
+    channel, vehicle = choice.channel.name, reading.vehicle
+    return report_fault("channel", FindingCode.DRY_RUN_NOT_ARMED, change, channel=channel, vehicle=vehicle)
 
 
 def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Finding]:
