@@ -10,7 +10,6 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE
 from edgevpr.mavlink.channel import Channel, ChannelChoice, VehicleKind, classify_vehicle
 from edgevpr.mavlink.ground import Announce
-from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.parameters import ALTERNATIVES, Decision, ParameterTable
 from edgevpr.mavlink.px4_parameters import PX4_TABLE
 from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
@@ -193,13 +192,13 @@ class ChannelSelector:
         faults = list(decision.faults)
         if choice.channel is Channel.NONE:
             log.warning("%s: %s", vehicle, choice.reason)
-            self._announce(Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC)
+            self._announce(messages.Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC)
         else:
             log.info("%s: sending positions via %s", vehicle, choice.reason)
             if faults:
-                self._announce(Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC)
+                self._announce(messages.Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC)
             elif self._reported or self._has_reported_missing:
-                self._announce(Severity.INFO, f"positions sent via {choice.channel.name}", TOPIC)
+                self._announce(messages.Severity.INFO, f"positions sent via {choice.channel.name}", TOPIC)
         for fault in faults:
             log.warning("%s", fault.reason)
 
@@ -213,4 +212,4 @@ class ChannelSelector:
             self._has_reported_missing = True
             log.warning("%s", self._decision.choice.reason)
             more = f" and {len(missing) - 1} more" if missing[1:] else ""
-            self._announce(Severity.WARNING, f"no answer for {missing[0]}{more}", TOPIC)
+            self._announce(messages.Severity.WARNING, f"no answer for {missing[0]}{more}", TOPIC)

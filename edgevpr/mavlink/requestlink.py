@@ -14,7 +14,6 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import VehicleKind, classify_vehicle
 from edgevpr.mavlink.channelselector import MAX_PARALLEL_REQUESTS
 from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S
-from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.parameters import ALTERNATIVES
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -127,7 +126,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         if self._port.connected and now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S
             # Generic type, not onboard controller: otherwise PX4 would report a lost companion after this exchange.
-            self._send(messages.make_heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
+            self._send(messages.make_heartbeat(messages.Health.BOOT, mavlink.MAV_TYPE_GENERIC))
         readable, _, _ = select.select([self._port], [], [], wait_s)
         # Reading an idle serial port would look like a disconnect. A refused datagram keeps a UDP port readable.
         data = self._port.read() if readable else b""
@@ -137,7 +136,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
     def _admit(self, message: Message) -> bool:
         is_heartbeat = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
-        if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
+        if message.get_srcComponent() != messages.AUTOPILOT or message.get_srcSystem() == 0:
             return False
         if is_heartbeat and self.system_id is None:
             self.system_id = self._packer.srcSystem = message.get_srcSystem()

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
-from edgevpr.places.mapfiles import is_row_error, translate_errors
 from edgevpr.places.mapspec import read_spec, read_stored, write_spec
-from edgevpr.places.rows import Content, Values
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -49,7 +47,7 @@ class MapConnection:
             if os.fstat(lock).st_size:
                 raise MapError(f"{path} exists already: choose another name, or add to it with --append.")
             undo.callback(mapfiles.remove_map, path)
-            with translate_errors(path):
+            with mapfiles.translate_errors(path):
                 db = mapfiles.connect(path, "rw")
                 undo.callback(db.close)
                 db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
@@ -77,7 +75,7 @@ class MapConnection:
 
     @classmethod
     def _open(cls, path: Path, is_writable: bool) -> "Self":
-        with ExitStack() as undo, translate_errors(path):
+        with ExitStack() as undo, mapfiles.translate_errors(path):
             lock = mapfiles.lock_map(path) if is_writable else None
             if lock is not None:
                 undo.callback(os.close, lock)
@@ -107,7 +105,7 @@ class MapConnection:
         """Raise MapError if the file is missing, cannot be read, or has been replaced by another map since it was
         opened. If another program has modified the file, it is reopened, and its map_id and technique are compared,
         because the old connection may have cached pages of a replaced file."""
-        with translate_errors(self.path):
+        with mapfiles.translate_errors(self.path):
             state = self._read_file_state()
             if state == self._file_state:
                 return
@@ -132,7 +130,7 @@ class MapConnection:
     def transaction(self) -> Iterator[None]:
         """Run the body of `with` as one transaction: commit everything that it writes, or roll back if it raises an
         exception. Raises MapError for SQLite errors."""
-        with translate_errors(self.path):
+        with mapfiles.translate_errors(self.path):
             self.db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -142,18 +140,18 @@ class MapConnection:
                     self.db.execute("ROLLBACK")
                 raise
 
-    def scan_rows(self, columns: str) -> Iterator[tuple[int, Values | None]]:
+    def scan_rows(self, columns: str) -> Iterator[tuple[int, rows.Values | None]]:
         """Yield (place id, values of `columns` or None if unreadable) of every place. Raises MapError."""
-        with translate_errors(self.path):
+        with mapfiles.translate_errors(self.path):
             yield from rows.scan_rows(self.db, columns)
 
-    def read_row(self, place_id: int, columns: str) -> Content:
+    def read_row(self, place_id: int, columns: str) -> rows.Content:
         """Return the values of `columns` of one place, by name. Raises PlaceError if it cannot be read."""
-        with translate_errors(self.path):
+        with mapfiles.translate_errors(self.path):
             try:
                 row = self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
             except sqlite3.Error as error:
-                if not is_row_error(error):
+                if not mapfiles.is_row_error(error):
                     raise
                 raise PlaceError(self.path, place_id, f"SQLite reports: {error}") from error
         if not row:
@@ -162,11 +160,11 @@ class MapConnection:
 
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""
-        with translate_errors(self.path):
+        with mapfiles.translate_errors(self.path):
             try:  # not count(*): no progress handler can interrupt it in a table that refers to itself
                 return int(self.db.execute("SELECT total(1) FROM places").fetchone()[0])
             except sqlite3.Error as error:
-                if not is_row_error(error):
+                if not mapfiles.is_row_error(error):
                     raise
         return sum(row is not None for _, row in self.scan_rows("1"))
 

@@ -16,10 +16,9 @@ from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
 from edgevpr.places.index import choose_places
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.rows import Content, RowError
 
 _MAX_FAULTS = 20  # to be listed by SQLite
-_NO_LANDMARKS: Content = {"landmarks": None, "landmarks_crc32": None}
+_NO_LANDMARKS: rows.Content = {"landmarks": None, "landmarks_crc32": None}
 _LOW_QUALITY_FACTOR = 0.5  # applied to the value of a place that was added only to close a gap
 
 
@@ -29,7 +28,7 @@ class PlaceCheck(NamedTuple):
 
     place_id: int
     problem: str | None
-    content: Content
+    content: rows.Content
     is_usable: bool
 
 
@@ -68,13 +67,13 @@ def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> It
                     rows.decode_part(content, "fine", spec.fine)
                 is_usable = True
                 rows.read_landmarks(content)
-        except RowError as error:
+        except rows.RowError as error:
             problem = str(error)
             content = {**content, **_NO_LANDMARKS}
         yield PlaceCheck(place_id, problem, content, is_usable)
 
 
-def _read_content(place_map: PlaceMap, place_id: int) -> tuple[Content, str | None]:
+def _read_content(place_map: PlaceMap, place_id: int) -> tuple[rows.Content, str | None]:
     """Return the row of a place, without landmarks that cannot be read, and the problem (None: none). The row is empty
     if the rest cannot be read either."""
     with suppress(PlaceError):

@@ -20,7 +20,6 @@ from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
 from edgevpr.places.mapfiles import is_row_error, translate_errors
-from edgevpr.places.rows import Content, RowError, Values
 
 _COARSE_COLUMNS = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
 _ATTRIBUTION_SEPARATOR = "; "
@@ -82,7 +81,7 @@ class PlaceMap(MapConnection):
             self.db.execute("DELETE FROM edgevpr_map WHERE key = 'calibration'")
             return self.insert(content)
 
-    def insert(self, content: Content, place_id: int | None = None) -> int:
+    def insert(self, content: rows.Content, place_id: int | None = None) -> int:
         """Insert a row with its checksums, inside a `transaction`; return its id. Raises sqlite3.Error."""
         row = {"place_id": place_id, **content, **rows.compute_checksums(content)}
         placeholders = ", ".join("?" * len(row))
@@ -142,7 +141,7 @@ class PlaceMap(MapConnection):
         """Return the mean of all readable coarse parts, float32 of the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan_rows(columns := "coarse, coarse_crc32"):
-            with suppress(RowError):
+            with suppress(rows.RowError):
                 part = rows.decode_part(rows.read_columns(columns, row), "coarse", self.spec.coarse)
                 count += 1
                 mean += (part - mean) / count
@@ -153,7 +152,7 @@ class PlaceMap(MapConnection):
         lon_deg), None if it has no position. Raises PlaceError for a place that is missing or damaged."""
         with self._convert_row_errors(place_id):
             if self.spec.fine is None:
-                raise RowError("it has no fine part")
+                raise rows.RowError("it has no fine part")
             content = self.read_row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
             point = rows.parse_point(content)
             return rows.decode_part(content, "fine", self.spec.fine), point
@@ -172,9 +171,9 @@ class PlaceMap(MapConnection):
         table = np.array(places, [("id", np.int64), ("length_m", float), ("is_surveyed", bool)])
         return table["id"], table["length_m"], table["is_surveyed"]
 
-    def select_ids(self, columns: str) -> dict[Values, list[int]]:
+    def select_ids(self, columns: str) -> dict[rows.Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""
-        ids: dict[Values, list[int]] = {}
+        ids: dict[rows.Values, list[int]] = {}
         for place_id, row in self.scan_rows(columns):
             if row:
                 ids.setdefault(row, []).append(place_id)
@@ -185,7 +184,7 @@ class PlaceMap(MapConnection):
         the place cannot be read. Between two runs, the last bits of values may differ, or a few elements."""
         try:
             stored = rows.decode_part(self.read_row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
-        except (RowError, PlaceError):
+        except (rows.RowError, PlaceError):
             return False
         candidate = np.asarray(coarse, np.float32).reshape(stored.shape)
         is_near = np.linalg.norm(stored - candidate) <= _MAX_RELATIVE_DIFFERENCE * np.linalg.norm(stored)
@@ -213,7 +212,7 @@ class PlaceMap(MapConnection):
         """Turn the exception `RowError`, raised in the body of `with`, into a PlaceError with the place's id."""
         try:
             yield
-        except RowError as error:
+        except rows.RowError as error:
             raise PlaceError(self.path, place_id, str(error)) from error
 
     @contextmanager
@@ -221,5 +220,5 @@ class PlaceMap(MapConnection):
         """If the body of `with` raises `RowError`, record the place and the reason in `left_out`, and continue."""
         try:
             yield
-        except RowError as error:
+        except rows.RowError as error:
             self.left_out.setdefault(place_id, str(error))
