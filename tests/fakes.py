@@ -133,9 +133,8 @@ def make_output(
 ) -> AutopilotOutput:
     """An autopilot at a link, with keys of the section `mavlink`."""
     config = load_config(None, {f"mavlink.{key}": value for key, value in settings.items()}).mavlink
-    return AutopilotOutput(
-        link, navigator, Notifier(flight_log or FlightLog(None), link), settings=config, cores=4, clock=clock.clock
-    )
+    notifier = Notifier(flight_log or FlightLog(None), link)
+    return AutopilotOutput(link, navigator, notifier, settings=config, cores=4, clock=clock.clock)
 
 
 class FakeLink:

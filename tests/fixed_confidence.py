@@ -31,9 +31,7 @@ class FixedModel:
 
 
 def make_model(
-    confidence: Callable[[Figures], float],
-    of_map: Callable[[Figures], float] | None = None,
-    needed: float = NEEDED,
+    confidence: Callable[[Figures], float], of_map: Callable[[Figures], float] | None = None, needed: float = NEEDED
 ) -> ConfidenceRule:
     """The decision by a confidence that is told what to say."""
     return ConfidenceRule(dict.fromkeys(MAP_FIGURES, FixedModel(confidence, of_map, needed)), 0.999)

@@ -48,9 +48,8 @@ def flight(tmp_path_factory):
 def valley(flight):
     path = flight / "valley.gpkg"
     done = []
-    made = edgevpr.build(
-        path, flight / "mapped", camera="nadir", calibrate=False, progress=lambda *step: done.append(step)
-    )
+    options = {"camera": "nadir", "calibrate": False, "progress": lambda *step: done.append(step)}
+    made = edgevpr.build(path, flight / "mapped", **options)
     assert done[:PLACES] == [(number, PLACES, "mapping") for number in range(1, PLACES + 1)]
     assert (made.technique, made.places, made.with_position) == ("cohog", PLACES, PLACES)
     return path
@@ -105,10 +104,9 @@ def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
             edgevpr.build(tmp_path / "m.gpkg", wrong)
     with edgevpr.Map(valley, fov_deg=60) as ground, pytest.raises(UsageError, match="height_m"):
         ground.match(draw_view(1))
+    grid = edgevpr.OrthophotoGrid(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)
     with pytest.raises(SourceError, match="nothing"):
-        edgevpr.build(
-            tmp_path / "m.gpkg", edgevpr.OrthophotoGrid(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)
-        )
+        edgevpr.build(tmp_path / "m.gpkg", grid)
     with pytest.raises(AttributeError):
         edgevpr.Mop  # noqa: B018
 

@@ -41,11 +41,7 @@ def test_wheel_is_pure_python_with_every_module_and_nothing_else(wheel):
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "edgevpr").rglob("*.py")}
     figures = {f"edgevpr/runtime/preflight/{name}.json" for name in ("accuracy", "counted")}
-    looks = {
-        "edgevpr/py.typed",
-        "edgevpr/review/page.css",
-        "edgevpr/review/page.js",
-    }
+    looks = {"edgevpr/py.typed", "edgevpr/review/page.css", "edgevpr/review/page.js"}
     assert {name for name in names if not name.startswith("edgevpr/shipped/")} == code | figures | looks
 
 
@@ -60,7 +56,6 @@ def test_wheel_works_without_the_checkout(wheel, tmp_path):
         "print(edgevpr.__file__, load_config(None).battery.pack, 'MemoryMax=' in render_unit(load_board('rpi-5')))"
     )
     environment = os.environ | {"PYTHONPATH": str(site)}
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=elsewhere, env=environment, capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=elsewhere, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [str(site / "edgevpr" / "__init__.py"), "4S5200", "True"]

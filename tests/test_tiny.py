@@ -10,9 +10,8 @@ from edgevpr.techniques import create
 
 
 def test_flight_sends_a_fix_for_a_recognised_image(tmp_path):
-    frames = [
-        Frame(image=draw_texture(n), name=f"{n}", t_mono_s=0.0, position=Position(50 + n / 1000, 8.0)) for n in range(5)
-    ]
+    positions = [Position(50 + n / 1000, 8.0) for n in range(5)]
+    frames = [Frame(image=draw_texture(n), name=f"{n}", t_mono_s=0.0, position=positions[n]) for n in range(5)]
     place_map, clock = make_map(tmp_path / "m.gpkg", create("cohog", {"w1": 208}), frames), FakeClock()
     link = FakeLink(clock)
     flight = Flight(place_map, tmp_path / "log", clock, link)

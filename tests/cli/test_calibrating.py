@@ -66,8 +66,7 @@ def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
 
 def test_map_build_builds_a_map_that_cannot_be_calibrated(flight, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES + 1)
-    down = ("--param", "camera=nadir", "--no-refine")
-    assert build_map(tmp_path / "small.gpkg", flight / "ref", *down) == 0
+    assert build_map(tmp_path / "small.gpkg", flight / "ref", "--param", "camera=nadir", "--no-refine") == 0
     said = capsys.readouterr()
     assert (said.out + said.err).count(f"it has {PLACES} places") == 1
     assert "expect:" not in said.out

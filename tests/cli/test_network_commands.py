@@ -43,8 +43,7 @@ def test_match_uses_one_map_in_all_forms(capsys, flight):
 
 def test_open_recogniser_uses_the_form_of_the_configuration(flight):
     path = build_map(flight, "--technique", "calc", "--param", "model=tiny")
-    config = load_config(None, {"map": str(path), "match.form": "1bit"})
-    recogniser = open_recogniser(config, load_board("this"))
+    recogniser = open_recogniser(load_config(None, {"map": str(path), "match.form": "1bit"}), load_board("this"))
     assert recogniser.index.rows.shape == (6, 8)
     reason = explain_technique(recogniser, is_named=False)
     assert reason.startswith("technique calc 1bit: ")

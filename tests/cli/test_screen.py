@@ -73,9 +73,8 @@ def test_main_escapes_names_of_images(tmp_path, capfd):
         picture = cv2.imencode(".jpg", draw_texture(1, 120, 160))[1].tobytes()
         (tmp_path / folder / RED_ESCAPE_NAME).write_bytes(picture)
         (tmp_path / folder / f"{number}\x1b[0m.jpg").write_bytes(b"no image")
-    code, *built = capture_output(
-        capfd, "map", "build", tmp_path / "m.gpkg", "--images", tmp_path / "ref", "--technique", "cohog"
-    )
+    flags = "--images", tmp_path / "ref", "--technique", "cohog"
+    code, *built = capture_output(capfd, "map", "build", tmp_path / "m.gpkg", *flags)
     assert code == 1
     _, out, err = capture_output(capfd, "match", tmp_path / "m.gpkg", "--images", tmp_path / "query")
     assert "1\\x1b[0m.jpg" in err

@@ -46,8 +46,7 @@ CONFIDENCE = {"confidence": 0.5, "min_confidence": 0.9995, "regions_ratio": 2.0,
     ],
 )
 def test_reason_sentence_omits_unknown_parameters(code, parameters, sentence):
-    codes = {each.name: each for each in CODES}
-    assert str(Reason(codes[code], parameters)) == sentence
+    assert [str(Reason(each, parameters)) for each in CODES if each.name == code] == [sentence]
 
 
 def test_reason_codes_are_all_different():

@@ -10,7 +10,6 @@ from loopback import PATIENCE_S
 
 from edgevpr.frames import streams
 from edgevpr.frames.decoding import TimedPacket
-from edgevpr.frames.streams import PacketQueue
 
 
 class Sender:
@@ -42,7 +41,7 @@ def sender():
 
 @pytest.fixture
 def arrivals(sender):
-    found = PacketQueue(sender.fetch, sender._clock, sender.is_closed.set)
+    found = streams.PacketQueue(sender.fetch, sender._clock, sender.is_closed.set)
     yield found
     sender.end()
     found.close()

@@ -19,9 +19,7 @@ from edgevpr.core.errors import SourceError
 from edgevpr.frames import live as live_module
 from edgevpr.frames import liveness
 from edgevpr.frames import source as source_module
-from edgevpr.frames.live import LiveSource
 from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, Shot
-from edgevpr.frames.source import open_source
 
 
 def read_next_frame(source):
@@ -183,7 +181,7 @@ def live():
             camera.step("open")
             return camera
 
-        sources.append(LiveSource(open_next, clock))
+        sources.append(live_module.LiveSource(open_next, clock))
         return sources[-1]
 
     yield make
@@ -261,7 +259,7 @@ def test_source_that_always_hangs_uses_at_most_three_threads(monkeypatch):
     monkeypatch.setattr(live_module, "_OPENING_TIMEOUT_S", 0.2)
     monkeypatch.setattr(live_module, "_FIRST_WAIT_S", 0.01)
     opened, go = [], threading.Event()
-    source = LiveSource(lambda: opened.append(1) or (go.wait(PATIENCE_S) and Camera()), time.monotonic)
+    source = live_module.LiveSource(lambda: opened.append(1) or (go.wait(PATIENCE_S) and Camera()), time.monotonic)
     wait_until(lambda: source.state == "lost: the opening hangs; 3 calls to it hang")
     assert len(opened) == 3
     go.set()
@@ -270,7 +268,7 @@ def test_source_that_always_hangs_uses_at_most_three_threads(monkeypatch):
 
 
 def test_driver_error_counts_as_a_loss_with_its_message():
-    source = LiveSource(lambda: [].index("no such codec"), time.monotonic)
+    source = live_module.LiveSource(lambda: [].index("no such codec"), time.monotonic)
     wait_until(lambda: source.state == "ValueError: 'no such codec' is not in list, reopening in 0.5 s")
     source.close()
 
@@ -302,7 +300,7 @@ def test_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch, live):
 def test_missing_device_is_awaited(name, tmp_path, monkeypatch):
     monkeypatch.setattr(source_module, "is_live", lambda uri: True)
     path = tmp_path / name
-    source = open_source(str(path), live=True)
+    source = source_module.open_source(str(path), live=True)
     wait_until(lambda: source.state.startswith(f"{path} does not exist, reopening in "))
     assert source.condition is Condition.LOST
     path.write_text("v=0")
@@ -323,5 +321,5 @@ LIVE = ("udp://:5600", "udp://@239.0.0.1:5600", "rtsp://user:secret@host/path", 
 )
 def test_open_source_refuses_sources_that_can_never_open(uri, live, complaint):
     with pytest.raises(SourceError) as refusal:
-        open_source(uri, live=live)
+        source_module.open_source(uri, live=live)
     assert complaint in str(refusal.value)

@@ -187,9 +187,8 @@ def track(write_table):
 
 
 def test_interpolate_tag_rotates_headings_the_shorter_way(track):
-    found = track(
-        "time,lat,lon,alt,yaw_deg,roll_deg,pitch_deg,rel_alt\n10,50,179.999,600,350,-4,2,80\n12,51,-179.999,604,20,4,,90\n"
-    )
+    rows = "10,50,179.999,600,350,-4,2,80\n12,51,-179.999,604,20,4,,90\n"
+    found = track(f"time,lat,lon,alt,yaw_deg,roll_deg,pitch_deg,rel_alt\n{rows}")
     half = found.interpolate_tag(11.0)
     assert half.position.lat_deg == 50.5
     assert abs(half.position.lon_deg) == pytest.approx(180)

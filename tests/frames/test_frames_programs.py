@@ -140,10 +140,8 @@ def test_pipeline_gives_images_and_ends_with_the_source(open_live_source, end):
 
 def test_programs_end_with_a_killed_flight(rpicam):
     before = list_processes()
-    reading = (
-        "from edgevpr.frames.source import open_source; s = open_source('rpicam', live=True)\nwhile True: s.read(1)"
-    )
-    flight = subprocess.Popen([sys.executable, "-c", reading])
+    opening = "from edgevpr.frames.source import open_source; s = open_source('rpicam', live=True)"
+    flight = subprocess.Popen([sys.executable, "-c", f"{opening}\nwhile True: s.read(1)"])
     wait_until(lambda: list_processes() - before)
     flight.kill()
     flight.wait()

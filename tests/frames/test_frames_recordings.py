@@ -77,9 +77,8 @@ def test_positions_come_from_the_csv_and_for_images_it_does_not_name_from_exif(f
     gps = {1: "N", 2: (50.0, 30.0, 0.0), 3: "E", 4: (14.0, 15.0, 0.0)}
     for name in ("in csv.jpg", "not in csv.jpg", "without.jpg"):
         photographs.write_jpeg(folder / name, gps)
-    (folder.parent / "positions.csv").write_text(
-        "file,lat,lon,yaw_deg,time,roll_deg,rel_alt\nin csv.jpg,1,2,90,7,-7,80\nwithout.jpg,,,,,,\n"
-    )
+    table = "file,lat,lon,yaw_deg,time,roll_deg,rel_alt\nin csv.jpg,1,2,90,7,-7,80\nwithout.jpg,,,,,,\n"
+    (folder.parent / "positions.csv").write_text(table)
     in_csv, not_in_csv, without = read_all_frames(open_source(str(folder), live=False))
     assert (in_csv.position, in_csv.heading_deg, in_csv.t_utc_s) == (Position(1.0, 2.0), 90.0, 7.0)
     assert (in_csv.roll_deg, in_csv.height_m) == (-7.0, 80.0)
@@ -103,8 +102,7 @@ def test_recorded_steps_need_a_time_of_each_image_in_order(folder, times, steps_
         write_picture(folder / f"{number}.jpg")
     assert read_intervals(str(folder)) == steps_s
     source = open_source(str(folder), live=True, steps_s=steps_s)
-    told = [source.step_s for _ in times if source.read(1.0)]
-    assert told == [*steps_s, *[None] * (len(times) - len(steps_s))]
+    assert [source.step_s for _ in times if source.read(1.0)] == [*steps_s, *[None] * (len(times) - len(steps_s))]
 
 
 def test_positions_that_do_not_fit_the_source_are_refused(folder, video, tmp_path):

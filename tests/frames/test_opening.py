@@ -29,9 +29,7 @@ from edgevpr.frames import streams
 from edgevpr.frames.devices import open_device
 from edgevpr.frames.shot import Condition, OpeningError, Shot
 from edgevpr.frames.source import open_source
-from edgevpr.frames.streams import open_address
 from edgevpr.runtime.service import camera
-from edgevpr.runtime.service.camera import check_frame
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 pytestmark = pytest.mark.network
@@ -62,7 +60,7 @@ def start_sending():
 
 def find_cause(uri):
     with pytest.raises(OpeningError) as refusal:
-        open_address(uri, lambda: 0.0, 0.5)
+        streams.open_address(uri, lambda: 0.0, 0.5)
     return str(refusal.value)
 
 
@@ -131,7 +129,7 @@ def test_open_source_finds_no_password_in_a_path_with_an_at_sign(uri, open_live_
 def test_open_address_decodes_a_percent_encoded_password(serve):
     right = "Basic " + base64.b64encode(b"pilot:geh#heim").decode()
     address = serve(answer_rtsp("401 Unauthorized", header=BASIC, authorization=right))
-    stream = open_address(f"rtsp://pilot:{PASSWORD}@{address}/stream", lambda: 0.0, 0.5)
+    stream = streams.open_address(f"rtsp://pilot:{PASSWORD}@{address}/stream", lambda: 0.0, 0.5)
     assert stream.facts.codec == "h264"
     stream.release()
 
@@ -229,7 +227,7 @@ def test_connection_of_a_multipart_stream_is_closed_with_the_capture(serve):
         except OSError:
             is_closed.set()
 
-    capture = open_address(f"http://{serve(answer)}/video", time.monotonic, 0.1)
+    capture = streams.open_address(f"http://{serve(answer)}/video", time.monotonic, 0.1)
     capture.read()
     capture.release()
     assert is_closed.wait(PATIENCE_S)
@@ -244,7 +242,7 @@ def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
         return encode_image(number)
 
     address = serve(answer_http("200 OK", "image/jpeg", take_snapshot))
-    capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
+    capture = streams.open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     first, second = capture.read(), capture.read()
     assert not (first.convert() == second.convert()).all()
     assert first.convert().shape == (HEIGHT, WIDTH, 3)
@@ -254,7 +252,7 @@ def test_snapshots_are_requested_repeatedly_and_aged_from_the_request(serve):
 
 def test_snapshots_cached_by_the_camera_are_aged_from_the_previous_request(serve):
     address = serve(answer_http("200 OK", "image/jpeg", lambda number: encode_image(number // 2)))
-    capture = open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
+    capture = streams.open_address(f"http://{address}/snapshot.jpg", time.monotonic, 0.1)
     *_, last = (capture.read() for _ in range(4))
     assert time.monotonic() - last.t_mono_s > 0.1
 
@@ -278,12 +276,12 @@ def test_snapshots_accept_a_password(serve):
         head = f"HTTP/1.0 {status}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
         connection.sendall(head.encode() + picture)
 
-    capture = open_address(f"http://pilot:{PASSWORD}@{serve(answer)}/snapshot.jpg", lambda: 0.0, 0.5)
+    capture = streams.open_address(f"http://pilot:{PASSWORD}@{serve(answer)}/snapshot.jpg", lambda: 0.0, 0.5)
     assert isinstance(capture.read(), Shot)
 
 
 def check_source(uri):
-    finding = check_frame("source", load_config(None, {"source.uri": uri}).source)
+    finding = camera.check_frame("source", load_config(None, {"source.uri": uri}).source)
     return finding.reason.code, finding.reason.parameters
 
 

@@ -39,9 +39,8 @@ def format_gimbal(yaw, pitch, roll, maker="drone-dji:Gimbal"):
     return f'{maker}YawDegree="{yaw}" {maker}PitchDegree="{pitch}" {maker}RollDegree="{roll}"'
 
 
-DJI = make_packet(
-    'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" ' + format_gimbal("-30.0", "-80.0", 0)
-)
+DJI_FLIGHT = 'drone-dji:RelativeAltitude="+40.10" drone-dji:FlightYawDegree="+10.0" '
+DJI = make_packet(DJI_FLIGHT + format_gimbal("-30.0", "-80.0", 0))
 AUTEL = make_packet('drone:RelativeAltitude="51.2" ' + format_gimbal(75, -90, 0, "drone:Gimbal"))
 SKYDIO_ATTRIBUTES = (
     '<drone-skydio:CameraOrientationNED drone-skydio:Pitch="-90" drone-skydio:Roll="0" drone-skydio:Yaw="75"/>'

@@ -26,8 +26,7 @@ def fly_legs(legs=5, a_leg=12, seed=0):
 def make_ties(position, log, seed=0, wrong=0.0, within=0.6):
     """Return noisy ties of all pairs that overlap; a share of them is wrong."""
     rng = np.random.default_rng((seed, 1))
-    away = abs(position[:, None] - position)
-    query, place = np.nonzero(np.tril(away < within * FOOTPRINT_M, -1))
+    query, place = np.nonzero(np.tril(abs(position[:, None] - position) < within * FOOTPRINT_M, -1))
 
     def draw_noise(sd):
         return sd * (rng.normal(size=len(query)) + 1j * rng.normal(size=len(query)))

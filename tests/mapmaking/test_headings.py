@@ -43,6 +43,5 @@ def test_find_headings_skips_level_frames_known_headings_and_hovers(frames):
     known = [replace(frame, heading_deg=7.0) for frame, _ in frames]
     still = [replace(frame, position=first.position) for frame, _ in frames]
     for unchanged in (level, known, still, [first], []):
-        assert [frame.heading_deg for frame in find_headings(unchanged, LENS)] == [
-            frame.heading_deg for frame in unchanged
-        ]
+        before = [frame.heading_deg for frame in unchanged]
+        assert [frame.heading_deg for frame in find_headings(unchanged, LENS)] == before

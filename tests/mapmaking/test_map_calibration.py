@@ -147,8 +147,7 @@ def test_calibration_reports_a_map_that_looks_alike_everywhere(tmp_path):
     waves = cv2.normalize(waves, None, 90, 130, cv2.NORM_MINMAX)
 
     def draw_water(number):
-        noise = np.random.default_rng(number).normal(0, 2, (240, 320))
-        image = np.clip(waves + noise, 0, 255).astype(np.uint8)
+        image = np.clip(waves + np.random.default_rng(number).normal(0, 2, (240, 320)), 0, 255).astype(np.uint8)
         return Frame(image=image, name=f"{number}.png", t_mono_s=0.0, position=Position(50 + 0.002 * number, 8.0))
 
     with PlaceMap.open_for_writing(make_map(tmp_path / "m.gpkg", AHEAD, map(draw_water, range(PLACES)))) as place_map:

@@ -49,8 +49,7 @@ def flown_dir(tmp_path_factory):
         cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), image)
         true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
         east_m += GLITCH_M if number == 9 else 0.0
-        at = move_position(true, east_m, north_m)
-        tags[f"{number:03d}.jpg"] = GeoTag(position=at)
+        tags[f"{number:03d}.jpg"] = GeoTag(position=move_position(true, east_m, north_m))
     write_positions(folder / "positions.csv", tags)
     return folder, poses
 
@@ -121,8 +120,7 @@ def test_refine_notices_positions_turned_against_the_recorded_headings(map_path,
     with PlaceMap.open_for_writing(map_path) as place_map, place_map.transaction():
         for place, pose in zip(list(place_map.read_places()), flown_dir[1], strict=True):
             recorded = Pose(up_deg=pose.heading_deg, footprint_m=FOOTPRINT_M, covariance_m2=(9.0, 0.0, 9.0))
-            there = Position(-place.position.lat_deg, -place.position.lon_deg)
-            place_map.move_place(place.place_id, there, recorded)
+            place_map.move_place(place.place_id, Position(-place.position.lat_deg, -place.position.lon_deg), recorded)
     refined = run_json(capsys, "map", "refine", map_path)
     assert (refined["refined"], abs(refined["turned_deg"])) == (0, pytest.approx(180, abs=8))
 
@@ -143,7 +141,6 @@ def test_refine_restarts_from_the_recorded_positions(map_path, capsys):
 def copy_some_places(unrefined_map, path, numbers, position=lambda number, place: place.position):
     """A map of some places of another, in this order, at other positions."""
     with PlaceMap.open(unrefined_map) as there, PlaceMap.create(path, there.spec) as place_map:
-        technique = create_technique(there)
         for place in there.read_places(numbers):
             fine, _ = there.read_fine_part(place.place_id)
             (coarse,) = (part for place_id, *_, part in there.read_coarse_parts() if place_id == place.place_id)
@@ -153,7 +150,7 @@ def copy_some_places(unrefined_map, path, numbers, position=lambda number, place
                 t_mono_s=0.0,
                 position=position(place.place_id, place),
             )
-            descriptor = technique.encode(np.zeros((64, 64), np.uint8))
+            descriptor = create_technique(there).encode(np.zeros((64, 64), np.uint8))
             descriptor = dataclasses.replace(descriptor, coarse=coarse, fine=fine)
             place_map.add(frame, descriptor, landmarks=there.read_landmarks(place.place_id))
     return path
@@ -161,8 +158,7 @@ def copy_some_places(unrefined_map, path, numbers, position=lambda number, place
 
 def refine_copy(path, images=None):
     with PlaceMap.open_for_writing(path) as place_map:
-        technique = create_technique(place_map)
-        return refine(place_map, technique, iterate_silently, images), list(place_map.read_places())
+        return refine(place_map, create_technique(place_map), iterate_silently, images), list(place_map.read_places())
 
 
 @pytest.mark.parametrize(
@@ -239,9 +235,8 @@ def test_refine_ties_images_by_votes_without_landmarks(tmp_path):
         for row in csv.DictReader((folder / "mosaic_positions.csv").open()):
             if (path := folder / "ref" / row["file"]).is_file():
                 here, image = (float(row["x_px"]) / 10, -float(row["y_px"]) / 10), read_image(path)
-                frame = Frame(
-                    image=image, name=row["file"], t_mono_s=0.0, position=Position(*offset_position(50.0, 8.0, *here))
-                )
+                position = Position(*offset_position(50.0, 8.0, *here))
+                frame = Frame(image=image, name=row["file"], t_mono_s=0.0, position=position)
                 place_map.add(frame, technique.encode(image))
     found, _ = refine_copy(tmp_path / "m.gpkg", folder / "ref")
     assert (found.refined, found.contradictory) == (19, ())

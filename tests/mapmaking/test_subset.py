@@ -60,9 +60,8 @@ def make_path(*points):
 
 @pytest.mark.parametrize("of_one", [True, False])
 def test_make_subset_copies_places_along_a_path_from_several_maps(maps, whole, tmp_path, of_one):
-    found = make_subset(
-        whole if of_one else maps, make_path((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, iterate_silently
-    )
+    source, path = whole if of_one else maps, make_path((0, 200), (400, 200))
+    found = make_subset(source, path, 110.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert list_names(tmp_path / "f.gpkg") == sorted(f"{column}{row}" for column in range(5) for row in (1, 2, 3))
     assert (found.maps, found.near, found.places, found.lost_calibration) == (1 if of_one else 4, 15, 15, False)
     assert found.file_bytes == (tmp_path / "f.gpkg").stat().st_size

@@ -28,9 +28,8 @@ def fly(ground, pitch_deg, count=24):
     for number in range(count):
         drift_deg = rng.normal(0, 1, 2).tolist()
         north_m = 20 + 6 * number
-        pose = CameraPose(
-            east_m=120, north_m=north_m, height_m=50, heading_deg=5 * drift_deg[0], pitch_deg=pitch_deg + drift_deg[1]
-        )
+        attitude = {"heading_deg": 5 * drift_deg[0], "pitch_deg": pitch_deg + drift_deg[1]}
+        pose = CameraPose(east_m=120, north_m=north_m, height_m=50, **attitude)
         yield photograph(ground, 0.25, pose, CAMERA, LIGHT, rng)
 
 

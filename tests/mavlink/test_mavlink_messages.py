@@ -62,10 +62,7 @@ def test_fix_refuses_undefined_values(wrong, says):
 def test_make_named_values_sends_integers_and_floats_and_omits_unknown_values():
     named = messages.make_named_values(12.5, vpr_place=4711, vpr_score=0.625, vpr_conf=None)
     heard = [(m.get_type(), m.name, m.value, m.time_boot_ms) for m in map(pack_and_unpack, named)]
-    assert heard == [
-        ("NAMED_VALUE_INT", "vpr_place", 4711, 12500),
-        ("NAMED_VALUE_FLOAT", "vpr_score", 0.625, 12500),
-    ]
+    assert heard == [("NAMED_VALUE_INT", "vpr_place", 4711, 12500), ("NAMED_VALUE_FLOAT", "vpr_score", 0.625, 12500)]
     (cpu,) = messages.make_named_values(2**32 / 1000 + 1.5, vpr_cpu=0.25)
     assert pack_and_unpack(cpu).time_boot_ms == 1500, "it wraps as its field does"
 

@@ -145,8 +145,7 @@ def test_parameter_rules_each_have_a_case(table):
 
 
 def test_parameter_faults_use_the_names_of_the_autopilot():
-    names = {name: OLD_NAMES.get(name, name) for name in SECOND}
-    old = {names[name]: value for name, value in SECOND.items()}
+    old = {OLD_NAMES.get(name, name): value for name, value in SECOND.items()}
     assert decide(old).choice.channel is Channel.GPS_INPUT
     assert decide(old | {"GPS_POS2_X": 3.0}).faults[0].changes == ("GPS_POS2_X=0",)
     assert decide(old | {"GPS_DELAY_MS2": 300}).faults[0].changes == ("GPS_DELAY_MS2=0",)

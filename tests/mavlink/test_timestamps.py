@@ -88,8 +88,7 @@ def test_time_stamps_refuse_an_invalid_or_unwritable_file_in_one_sentence(path, 
 def test_time_stamps_continue_on_a_full_disk(path, monkeypatch, caplog):
     clock = FakeClock()
     stamps = make_stamps(path, clock=clock)
-    disk_full = OSError(28, "disk full")
-    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", Mock(side_effect=disk_full))
+    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", Mock(side_effect=OSError(28, "disk full")))
     tries = []
     monkeypatch.setattr("edgevpr.mavlink.signing.Thread.start", lambda thread: tries.append(thread.run()))
     first = stamps.next()

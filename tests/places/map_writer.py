@@ -17,10 +17,8 @@ SPEC = TechniqueSpec(name="test", parameters={"seed": 1}, coarse=PartSpec((64,),
 def frame(number: int) -> Frame:
     position = None if number % 5 == 0 else Position(50.0 + number * 1e-4, 8.0, 100.0 + number)
     image = np.zeros((16, 16), np.uint8)
-    name = f"{number:05d}.jpg"
-    return Frame(
-        image=image, name=name, t_mono_s=0.0, t_utc_s=1.7e9 + number, position=position, heading_deg=number % 360
-    )
+    fields = {"t_mono_s": 0.0, "t_utc_s": 1.7e9 + number, "position": position, "heading_deg": number % 360}
+    return Frame(image=image, name=f"{number:05d}.jpg", **fields)
 
 
 def make_descriptor(number: int) -> Descriptor:

@@ -167,9 +167,8 @@ def test_place_map_keeps_a_place_whose_name_and_time_cannot_be_written(map_path)
 
 def test_open_for_writing_admits_one_program_at_a_time(map_path):
     with PlaceMap.open_for_writing(map_path) as place_map:
-        second = subprocess.run(
-            [sys.executable, map_writer.__file__, str(map_path), "1"], capture_output=True, text=True, timeout=60
-        )
+        command = [sys.executable, map_writer.__file__, str(map_path), "1"]
+        second = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert "MapBusyError" in second.stderr
         with PlaceMap.open(map_path) as reader:  # to look is allowed
             assert len(reader) == len(place_map) == PLACES

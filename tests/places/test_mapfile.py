@@ -71,8 +71,7 @@ def test_gdal_reads_the_places(map_path):
     assert list(columns["source_image"]) == [frame(n).name for n in range(10)]
     assert columns["time"][3] == np.datetime64("2023-11-14T22:13:23.000")
     assert geometry[0] is None
-    lon_lat = np.frombuffer(geometry[3][-16:], "<f8")
-    np.testing.assert_allclose(lon_lat, (8.0, 50.0003))
+    np.testing.assert_allclose(np.frombuffer(geometry[3][-16:], "<f8"), (8.0, 50.0003))
     np.testing.assert_array_equal(np.frombuffer(columns["coarse"][4], "<f2"), make_descriptor(4).coarse)
 
 

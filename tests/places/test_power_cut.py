@@ -66,9 +66,8 @@ def count_places(path: Path) -> int:
         places = list(place_map.read_places())
         assert [place.source_image for place in places] == [frame(number).name for number in range(len(places))]
         for place in places:
-            np.testing.assert_array_equal(
-                place_map.read_fine_part(place.place_id)[0], make_descriptor(place.place_id - 1).fine
-            )
+            fine, _ = place_map.read_fine_part(place.place_id)
+            np.testing.assert_array_equal(fine, make_descriptor(place.place_id - 1).fine)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     with contextlib.closing(sqlite3.connect(path)) as db:
         assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)

@@ -60,9 +60,8 @@ def ranking(compared, rest=(), unread=()):
     slots = [*compared, *(slot for slot, _ in rest)]
     scores = [*compared.values(), *(score for _, score in rest)]
     matches = {slot: FineMatch(score) for slot, score in compared.items()}
-    return Ranking(
-        slots=np.array(slots), scores=np.array(scores, np.float32), compared=matches, unread=np.array(unread, np.intp)
-    )
+    slots, scores, unread = np.array(slots), np.array(scores, np.float32), np.array(unread, np.intp)
+    return Ranking(slots=slots, scores=scores, compared=matches, unread=unread)
 
 
 def test_merge_rankings_keeps_the_better_match_of_a_place_in_both():

@@ -4,7 +4,6 @@ import pytest
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.power import equations
-from edgevpr.power.equations import Pack, parse_pack
 
 # Table 5.2: U_e, U_m, t_e s, t_m s (all 7494 references), Ah_t of 4781 queries; a = 0, s = 1, V = 2.5 V.
 TABLE_5_2 = {
@@ -43,14 +42,14 @@ def test_stage_energy_is_idle_energy_plus_marginal_energy():
 
 def test_pack_ah_counts_the_regulator():
     # 36 kJ are 10 Wh: 10 / 14.8 / 0.8 Ah from four cells behind a regulator of 80 %.
-    assert equations.pack_ah(36_000, Pack(4, 5200), 0.8) == pytest.approx(10 / 14.8 / 0.8, abs=1e-12)
+    assert equations.pack_ah(36_000, equations.Pack(4, 5200), 0.8) == pytest.approx(10 / 14.8 / 0.8, abs=1e-12)
 
 
 @pytest.mark.parametrize(
     ("text", "cells", "capacity_mah"), [("4S5200", 4, 5200), ("6s16000", 6, 16000), (" 1S450 ", 1, 450)]
 )
 def test_parse_pack_reads_a_label(text, cells, capacity_mah):
-    pack = parse_pack(text)
+    pack = equations.parse_pack(text)
     assert (pack.cells, pack.capacity_mah) == (cells, capacity_mah)
     assert pack.nominal_v == pytest.approx(3.7 * cells)
 
@@ -58,5 +57,5 @@ def test_parse_pack_reads_a_label(text, cells, capacity_mah):
 @pytest.mark.parametrize("text", ["", "0S5200", "4S0", "4S", "S5200", "4P5200", "-4S5200", "25S100", "4S5200mAh"])
 def test_parse_pack_refuses_nonsense_in_one_sentence(text):
     with pytest.raises(ConfigError) as raised:
-        parse_pack(text)
+        equations.parse_pack(text)
     assert all(part in str(raised.value) for part in (f"`{text}`", "(1 to 24)", "(1 to 999999)", "4S5200."))

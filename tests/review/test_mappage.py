@@ -74,14 +74,10 @@ def test_map_page_is_never_written_over_the_map(folder, capsys):
 
 
 def test_find_gaps_finds_ground_missing_between_images(tmp_path):
-    places = [
-        replace(
-            place, pose=replace(place.pose, up_deg=0.0), position=Position(*to_lat_lon(east * STEP_M, north * STEP_M))
-        )
-        for east in range(5)
-        for north in range(5)
-        for place in write_places(tmp_path)[:1]
-    ]
+    place, *_ = write_places(tmp_path)
+    pose, steps_m = replace(place.pose, up_deg=0.0), [number * STEP_M for number in range(5)]
+    positions = [Position(*to_lat_lon(east_m, north_m)) for east_m in steps_m for north_m in steps_m]
+    places = [replace(place, pose=pose, position=position) for position in positions]
     gaps, covered_m2, gaps_m2 = find_gaps(places)
     assert (gaps, gaps_m2) == ([], 0.0)
     assert covered_m2 == pytest.approx((4 * STEP_M + 30) ** 2, rel=0.1)

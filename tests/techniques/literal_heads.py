@@ -18,9 +18,8 @@ def pyramid(features, levels):
 
     _, height, width = features.shape
     bins = [(n, row, column) for n in levels for row in range(n) for column in range(n)]
-    return np.concatenate(
-        [features[:, cover(row, n, height), cover(column, n, width)].max(axis=(1, 2)) for n, row, column in bins]
-    )
+    covered = (features[:, cover(row, n, height), cover(column, n, width)] for n, row, column in bins)
+    return np.concatenate([each.max(axis=(1, 2)) for each in covered])
 
 
 def project_vector(vector, row, signs, length):
@@ -54,9 +53,8 @@ def rmac_regions(height, width):
 
 def rmac_vectors(features, regions):
     """The largest of each channel in each region, to the power of one half."""
-    largest = np.array(
-        [features[:, top : top + side, left : left + side].max(axis=(1, 2)) for top, left, side in regions], float
-    )
+    squares = (features[:, top : top + side, left : left + side] for top, left, side in regions)
+    largest = np.array([square.max(axis=(1, 2)) for square in squares], float)
     return normalise_rows(np.sign(largest) * np.sqrt(abs(largest)))
 
 
@@ -107,8 +105,7 @@ def sum_box(features, inside):
 def mutual_score(query, place):
     """The sum of what those pairs have in common of which each is the other's best, over the larger number."""
     likeness = query @ place.T
-    best = likeness.argmax(axis=1)
-    mutual = [max(likeness[i, j], 0.0) for i, j in enumerate(best) if likeness[:, j].argmax() == i]
+    mutual = [max(likeness[i, j], 0.0) for i, j in enumerate(likeness.argmax(axis=1)) if likeness[:, j].argmax() == i]
     return sum(mutual) / max(len(query), len(place))
 
 

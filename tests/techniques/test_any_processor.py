@@ -55,9 +55,8 @@ def compute_checksums(**environment):
     asked = "import test_any_processor; test_any_processor.print_checksums()"
     cwd = Path(__file__).parent
     env = {**os.environ, **environment}
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", asked], capture_output=True, text=True, check=True, cwd=cwd, env=env
-    )
+    command = [sys.executable, "-W", "ignore", "-c", asked]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=cwd, env=env)
     return dict(line.split(": ") for line in done.stdout.splitlines())
 
 

@@ -92,8 +92,7 @@ def test_support_is_computed_from_all_regions(step, asked):
     asking = np.sort(rng.choice(100, asked, replace=False))
     regions = np.where(rng.random((asked, 1)) < 0.7, np.roll(reference, 11, axis=0)[asking], reference[asking][::-1])
     regions = (regions + rng.integers(-2, 3, regions.shape)).astype(np.float32)
-    best = (regions @ reference.T).argmax(axis=1)
-    found = measure_support(asking, regions, reference, best, step)
+    found = measure_support(asking, regions, reference, (regions @ reference.T).argmax(axis=1), step)
     expected = compute_support(asking.tolist(), regions, reference, step)
     assert (found.back, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
 

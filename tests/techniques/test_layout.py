@@ -6,7 +6,6 @@ from pictures import draw_texture, render_view
 
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
-from edgevpr.techniques.layout import PLACE_BYTES
 
 SIDE_PX = 256
 PLACES = 6
@@ -80,7 +79,7 @@ def test_score_places_scores_all_places_in_reach_and_some_others_of_a_large_map(
 
 def test_rows_of_any_bytes_have_finite_scores(town):
     technique, _ = town
-    damaged = np.random.default_rng(2).integers(0, 256, (4, PLACE_BYTES), np.uint8)
+    damaged = np.random.default_rng(2).integers(0, 256, (4, layout.PLACE_BYTES), np.uint8)
     damaged[1:] = np.array([[0], [255], [NOTHING + 1]])
     scores, by_hypothesis = technique.score_places(technique.encode(draw_view(2)), damaged, None)
     assert np.isfinite(scores).all()
@@ -107,7 +106,7 @@ def list_possible_rotations(by_hypothesis):
 @pytest.mark.slow
 def test_score_places_allows_only_rotations_near_the_expected_one(town):
     technique, rows = town
-    query, rows = technique.encode(draw_view(0)), np.resize(rows, (8, PLACE_BYTES))
+    query, rows = technique.encode(draw_view(0)), np.resize(rows, (8, layout.PLACE_BYTES))
     scores, by_rotation = technique.score_places(query, rows, None, np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan]))
     sets = list_possible_rotations(by_rotation)
     assert sets[:3] == [[0, 15, 345], [0, 15, 345], [0, 15, 30]]

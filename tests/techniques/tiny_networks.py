@@ -44,8 +44,7 @@ def write_network(folder: Path, name: str = "tiny", fault: str | None = None, ca
 
 def write_card(path: Path, changes: dict) -> Path:
     """The card `CARD` with some keys changed. JSON is YAML."""
-    values = {**CARD, **changes}
-    path.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items()))
+    path.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in {**CARD, **changes}.items()))
     return path
 
 

@@ -65,9 +65,8 @@ def write_tlog(path, points, shots=()):
         blocks.append(add_stamp(t_s, position))
     for t_s, lat, lon, alt, height, roll, pitch, yaw in shots:
         where = round(lat * 1e7), round(lon * 1e7), alt, height
-        taken = dialect.MAVLink_camera_feedback_message(
-            int(1e6 * (START_S + t_s)), 1, 0, 0, *where, roll, pitch, yaw, 0, 0
-        )
+        values = int(1e6 * (START_S + t_s)), 1, 0, 0, *where, roll, pitch, yaw, 0, 0
+        taken = dialect.MAVLink_camera_feedback_message(*values)
         blocks.append(add_stamp(t_s, taken))
     path.write_bytes(b"".join(blocks))
 

@@ -154,10 +154,8 @@ def fly_curves(count=40):
         turn = cv2.getRotationMatrix2D((at[number].real, -at[number].imag), np.degrees(course[number]) + 30, 1.0)
         turn[:, 2] += SIDE_PX / 2 - np.array([at[number].real, -at[number].imag])
         pictures.append(cv2.warpAffine(ground.astype(np.uint8), turn, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR))
-    track = [
-        (t, *offset_position(*HOME, east, north)) for t, east, north in zip(t_s.tolist(), at.real, at.imag, strict=True)
-    ]
-    return track, pictures
+    rows = zip(t_s.tolist(), at.real, at.imag, strict=True)
+    return [(t, *offset_position(*HOME, east, north)) for t, east, north in rows], pictures
 
 
 @pytest.mark.slow

@@ -184,9 +184,8 @@ def test_read_record_refuses_two_positions_for_a_name(tmp_path, lat_deg, is_acce
 
 
 def test_place_pictures_goes_by_the_folder_where_names_repeat(tmp_path):
-    (tmp_path / "table.csv").write_text(
-        "SourceFile,GPSLatitude,GPSLongitude\nDCIM/100MEDIA/a.JPG,50,8\nDCIM/101MEDIA/a.JPG,51,8\nDCIM/b.JPG,52,8\n"
-    )
+    rows = "DCIM/100MEDIA/a.JPG,50,8\nDCIM/101MEDIA/a.JPG,51,8\nDCIM/b.JPG,52,8\n"
+    (tmp_path / "table.csv").write_text(f"SourceFile,GPSLatitude,GPSLongitude\n{rows}")
     record = read_record(tmp_path / "table.csv")
     for folder, lat_deg in (("100MEDIA", 50), ("101MEDIA", 51)):
         (tmp_path / folder).mkdir()

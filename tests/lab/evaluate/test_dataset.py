@@ -120,9 +120,8 @@ def test_open_folder_matches_positions_by_distance(tmp_path, caplog):
     places = {"near.jpg": (3, 0), "beside.jpg": (20, 0), "far.jpg": (60, 0)}
     for side, offsets in (("query", queries), ("ref", places)):
         write_pictures(tmp_path / side, [*offsets, "nowhere.jpg"])
-        rows = [
-            f"{name},{','.join(map(repr, offset_position(*here, *offset_m)))}" for name, offset_m in offsets.items()
-        ]
+        points = {name: offset_position(*here, *offset_m) for name, offset_m in offsets.items()}
+        rows = [f"{name},{','.join(map(repr, point))}" for name, point in points.items()]
         (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
     dataset, unplaced = open_folder(tmp_path, 25), {"nowhere.jpg"}
     assert list_correct(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, unplaced), "far.jpg": (set(), unplaced)}

@@ -56,9 +56,8 @@ def test_evaluate_measures_recall_costs_and_sizes(folder, name, parameters):
 
 
 def test_evaluate_counts_a_match_accepted_off_the_map(folder):
-    cv2.imwrite(
-        str(folder / "ref" / "r7.png"), draw_texture(7)
-    )  # its twin is in the map, and the truth has no place for it
+    # Its twin is in the map, and the truth has no place for it.
+    cv2.imwrite(str(folder / "ref" / "r7.png"), draw_texture(7))
     result = evaluate(folder, "cohog", COHOG)
     assert (result.accepted_off_map, result.accepted_wrong, result.accepted_elsewhere) == (1, 2, 2)
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import list_names, read_truth
-from edgevpr.lab.evaluate.metrics import compute_figures, compute_quality, rank_of_first_correct, wilson_interval
 
 DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[4] / "shared" / "data")
 PUBLISHED = DATA / "vprbench_precomputed"
@@ -23,7 +22,7 @@ NEVER = math.inf
 def measure_queries(*queries):
     """The figures of queries (score, rank of the first right reference[, False: its place is not in the map])."""
     scores, ranks, has_match = zip(*((*query, True)[:3] for query in queries), strict=True)
-    return SimpleNamespace(**compute_quality(np.array(scores), np.array(ranks), np.array(has_match)))
+    return SimpleNamespace(**metrics.compute_quality(np.array(scores), np.array(ranks), np.array(has_match)))
 
 
 def test_compute_quality_of_a_perfect_run_with_ties():
@@ -88,7 +87,7 @@ def test_wilson_interval_equals_published_values(right, of):
     from scipy import stats
 
     expected = stats.binomtest(right, of).proportion_ci(method="wilson")
-    assert wilson_interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
+    assert metrics.wilson_interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
 
 
 # Few distinct scores, so that ties are usual; and the rank of the first right one, infinite where there is none.
@@ -103,7 +102,7 @@ def test_compute_figures_equal_those_of_scikit_learn(queries):
 
     scores, ranks = (np.array(column, float) for column in zip(*queries, strict=True))
     right = ranks == 0
-    found = compute_figures(scores, ranks, np.isfinite(ranks))
+    found = metrics.compute_figures(scores, ranks, np.isfinite(ranks))
     assert found.recall_at_1 == right.mean()
     if not right.any():
         return
@@ -135,10 +134,10 @@ def test_compute_figures_gives_the_published_figures_of_eight_matrices():
     for name, row in published.items():
         scores = np.load(PUBLISHED / f"corridor_{name}.npy")
         ranks = [
-            rank_of_first_correct(np.argsort(-row, kind="stable"), is_correct)
+            metrics.rank_of_first_correct(np.argsort(-row, kind="stable"), is_correct)
             for row, is_correct in zip(scores, correct, strict=True)
         ]
-        found = compute_figures(scores.max(axis=1), np.array(ranks), correct.any(axis=1))
+        found = metrics.compute_figures(scores.max(axis=1), np.array(ranks), correct.any(axis=1))
         for figure, value in row.items():
             if not figure.startswith("t_"):
                 assert getattr(found, ours.get(figure, figure)) == pytest.approx(float(value), abs=5e-4)

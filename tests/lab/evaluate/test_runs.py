@@ -16,10 +16,8 @@ def test_eval_prints_every_row_of_every_set_with_its_answers(tmp_path, capsys):
     content = run_json(capsys, "eval", "--data", *sets, *flags)
     assert content["machine"]["cpu"]
     assert content["versions"]["numpy"]
-    rows = ["hog", "hog 1bit", "cohog"]
-    assert [(row["set"], row["row"]) for row in content["results"]] == [
-        (on, row) for on in ("meadow", "town") for row in rows
-    ]
+    asked = [(on, row) for on in ("meadow", "town") for row in ("hog", "hog 1bit", "cohog")]
+    assert [(row["set"], row["row"]) for row in content["results"]] == asked
     for row in content["results"]:
         assert (row["queries"], row["queries_off_map"], row["unscored"]) == (5, 1, 1)
         assert row["pcu"] > 0

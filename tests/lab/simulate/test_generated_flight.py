@@ -8,13 +8,7 @@ import pytest
 
 from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.demo import summarise
-from edgevpr.lab.simulate.generated import (
-    SCENE_DEPTH_M,
-    SCENE_WIDTH_M,
-    plan_mapping_flight,
-    to_metres,
-    write_flight,
-)
+from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M, plan_mapping_flight, to_metres, write_flight
 from edgevpr.lab.simulate.landscape import make_scene
 
 

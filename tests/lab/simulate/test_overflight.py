@@ -27,10 +27,8 @@ LEVEL = CameraPose(east_m=0, north_m=0, height_m=80, heading_deg=0)
 @pytest.fixture(scope="module")
 def orthophoto(tmp_path_factory):
     """Marked ground of 300 m, in Web Mercator and turned: the flight must not show it."""
-    path = write_marked_raster(
-        tmp_path_factory.mktemp("ground") / "o.tif", "EPSG:3857", pixel_m=0.4, side_px=750, rotation_deg=30
-    )
-    return Orthophoto(path)
+    path = tmp_path_factory.mktemp("ground") / "o.tif"
+    return Orthophoto(write_marked_raster(path, "EPSG:3857", pixel_m=0.4, side_px=750, rotation_deg=30))
 
 
 @pytest.mark.parametrize(

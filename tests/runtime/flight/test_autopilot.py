@@ -57,8 +57,7 @@ def test_fix_without_a_link_is_reported(recording, tmp_path, clock):
 
 
 def test_refused_match_has_no_fix(make_flight, clock, link):
-    lines = make_flight().fly(FakeSource(draw_pictures(2, first=100), clock))
-    assert list_fixes(lines) == [None, None]
+    assert list_fixes(make_flight().fly(FakeSource(draw_pictures(2, first=100), clock))) == [None, None]
     assert link.stats().fixes_sent == 0
 
 
@@ -103,8 +102,7 @@ def test_camera_lost_is_announced_and_critical_until_it_is_back(make_flight, clo
 
 def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, caplog):
     link.send_fix = lambda fix: 1 / 0
-    lines = make_flight().fly(FakeSource(draw_pictures(2), clock))
-    assert len(select(lines, "query")) == 2
+    assert len(select(make_flight().fly(FakeSource(draw_pictures(2), clock)), "query")) == 2
     assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ZeroDivisionError] * 2
 
 

@@ -15,11 +15,10 @@ def list_queries(lines):
 
 def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_flight, clock, link):
     answers, health = [], []
-    wishes = {2: UserCommand.PAUSE, 5: UserCommand.RESUME}
 
     def work():
         health.append(link.health.name)
-        if wish := wishes.get(len(health)):
+        if wish := {2: UserCommand.PAUSE, 5: UserCommand.RESUME}.get(len(health)):
             answers.append(link.send_command(wish))
 
     lines = make_flight().fly(FakeSource(draw_pictures(7), clock, work=work))
@@ -53,8 +52,7 @@ def test_pause_feeds_the_watchdog_and_shows_in_the_status(make_flight, clock, li
     assert systemd.watchdog_interval_s() == 1.0
     monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
     source = FakeSource(draw_pictures(9), clock, work=lambda: link.send_command(UserCommand.PAUSE))
-    lines = make_flight().fly(source)
-    assert list_queries(lines) == ["frame 000000"]
+    assert list_queries(make_flight().fly(source)) == ["frame 000000"]
     assert sum("WATCHDOG" in each for each in told) == 9
     assert "1 queries" in told[-2]["STATUS"]
     assert "; paused" in told[-2]["STATUS"]

@@ -66,8 +66,7 @@ def test_damaged_columns_never_end_the_flight_or_send_a_position_outside_the_map
     queries, _, flight = fly_acts(place_map, tmp_path / "log", [partial(damage, value) for value in DAMAGE])
     assert len(queries) == len(DAMAGE)
     assert flight.end["queries"] == len(DAMAGE)
-    sent = flight.link.stats().fixes_sent
-    assert sent == sum(line["accepted"] and bool(line["fix"]["sent"]) for line in queries)
+    assert flight.link.stats().fixes_sent == sum(line["accepted"] and bool(line["fix"]["sent"]) for line in queries)
     for line in queries:
         if line["fix"] and line["fix"]["sent"]:
             assert is_mapped(line)

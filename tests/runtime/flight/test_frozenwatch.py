@@ -43,8 +43,7 @@ def draw_clock_over_frozen(picture, rng, count):
 @pytest.mark.parametrize(("speed_m_s", "within_s"), [(10.0, 3), (5.0, 5)])
 def test_frozen_watch_refuses_static_images_in_flight_until_they_change(ground, harm, speed_m_s, within_s):
     flown = CameraFlight(ground)
-    last = flown.fly_on(6, speed_m_s)[-1]
-    for picture in harm(last, flown.rng, 16):
+    for picture in harm(flown.fly_on(6, speed_m_s)[-1], flown.rng, 16):
         flown.show(picture, velocity_m_s=(speed_m_s, 0.0))
     assert flown.refused == [None] * (5 + within_s) + [UNCHANGED] * (17 - within_s)
     flown.autopilot.reset_navigation.assert_called_once()

@@ -56,9 +56,8 @@ def test_governor_lowers_candidates_before_the_rate_in_flight(recording, tmp_pat
     monkeypatch.setattr(
         Recogniser, "step", lambda self, *asked: (compared.append(self.candidates), step(self, *asked))[1]
     )
-    changes, _, texts, _ = govern(
-        recording / "cohog.gpkg", tmp_path / "log", [BUSY] * 99, 12, (20,), **{"source.rate_hz": 60.0}
-    )
+    place_map, keys = recording / "cohog.gpkg", {"source.rate_hz": 60.0}
+    changes, _, texts, _ = govern(place_map, tmp_path / "log", [BUSY] * 99, 12, (20,), **keys)
     assert [line["to"]["candidates"] for line in changes] == [20] * 5
     assert [line["to"]["rate_hz"] for line in changes] == [60.0, 30.0, 15.0, 7.5, 7.5]
     assert set(compared) == {42, 20}

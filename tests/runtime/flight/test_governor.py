@@ -148,7 +148,6 @@ def test_governor_lowers_the_rate_while_other_programs_delay_queries():
 
 
 def test_governor_reports_low_memory_once():
-    flight = Flight(lambda setting, now_s: make_reading(rss_mb=500.0))
-    (change,) = flight.fly(600)
+    (change,) = Flight(lambda setting, now_s: make_reading(rss_mb=500.0)).fly(600)
     assert change.before == change.after == REQUESTED
     assert change.why.code is ReasonCode.MEMORY_OVER_LIMIT

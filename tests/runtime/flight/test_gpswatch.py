@@ -35,9 +35,8 @@ class GpsHover:
         """Watch a match that is so far east of GPS, and return whether GPS is wrong."""
         t_s = BEGIN_S + after_s
         vehicle = vehicle or make_vehicle(*HOME, t_s, gps=make_receiver(HOME, self.sd_m[1], t_s), **said)
-        self.watch.update(
-            make_match(Position(*offset_position(*HOME, off_m, 0.0)), t_s, vehicle, self.sd_m[0], places, view, lean)
-        )
+        position = Position(*offset_position(*HOME, off_m, 0.0))
+        self.watch.update(make_match(position, t_s, vehicle, self.sd_m[0], places, view, lean))
         return self.watch.is_wrong
 
     def matches(self, *offsets_m, begin_s=0):

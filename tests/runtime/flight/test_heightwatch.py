@@ -54,9 +54,8 @@ def test_height_watch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
 
 
 def test_height_watch_accepts_a_reported_height_of_zero(watch):
-    assert watch.update(*[100] * 5, reported_m=0.0) == [
-        format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=1.0, image_height_m=100.0)
-    ]
+    note = format_note(ReasonCode.HEIGHT_DIFFERS, autopilot_height_m=1.0, image_height_m=100.0)
+    assert watch.update(*[100] * 5, reported_m=0.0) == [note]
     assert watch.watch.ratio == 100.0
 
 

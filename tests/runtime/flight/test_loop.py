@@ -32,8 +32,7 @@ def test_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
         flown.stop()
 
     object.__setattr__(clock.clock, "sleep", sleep)
-    lines = flown.fly(FakeSource([PICTURE] * 9, clock))
-    assert len(select(lines, "query")) == 1
+    assert len(select(flown.fly(FakeSource([PICTURE] * 9, clock)), "query")) == 1
     assert slept == [pytest.approx(0.2)]
 
 
@@ -45,8 +44,7 @@ def test_stop_interrupts_the_recognition_of_a_frame(flight, clock):
         raise AssertionError("the signal breaks this off")
 
     flown.recogniser.technique.encode = encode_until_stop
-    lines = flown.fly(FakeSource([PICTURE] * 9, clock))
-    assert lines == [], "what was broken off is no query"
+    assert flown.fly(FakeSource([PICTURE] * 9, clock)) == [], "what was broken off is no query"
     flown.stop()  # and a second signal finds nothing to break off
 
 
@@ -54,8 +52,7 @@ def test_stop_lets_observers_finish(flight, clock):
     flown = flight()
     send = flown.link.send
     flown.link.send = lambda *messages: (flown.stop(), send(*messages))
-    lines = flown.fly(FakeSource([PICTURE] * 9, clock))
-    assert len(select(lines, "query")) <= 1
+    assert len(select(flown.fly(FakeSource([PICTURE] * 9, clock)), "query")) <= 1
     stop = Stop()
     with pytest.raises(StopNow), stop.allow_interrupt():
         stop()
@@ -73,8 +70,7 @@ def test_stop_before_the_start_ends_the_flight_at_once():
 
 def test_unreadable_frame_is_logged_and_the_next_one_recognised(flight, clock):
     flown = flight()
-    pictures = [PICTURE, ImageError("1.png truncated"), PICTURE]
-    lines = flown.fly(FakeSource(pictures, clock, is_live=False))
+    lines = flown.fly(FakeSource([PICTURE, ImageError("1.png truncated"), PICTURE], clock, is_live=False))
     assert [line["reason"]["parameters"] for line in select(lines, "unusable")] == [{"problem": "1.png truncated"}]
     assert len(select(lines, "query")) == 2
     assert (flown.end["queries"], flown.end["unusable"]) == (2, 1)
@@ -128,8 +124,7 @@ def test_recorded_flight_follows_the_times_of_its_images(flight, clock):
             return super().read(timeout_s)
 
     steps = iter((0.5, 0.0, 7.0))
-    lines = flight().fly(Timed([PICTURE] * 4, clock, is_live=False))
-    taken = [line["t_frame_s"] for line in select(lines, "query")]
+    taken = [line["t_frame_s"] for line in select(flight().fly(Timed([PICTURE] * 4, clock, is_live=False)), "query")]
     assert [each - taken[0] for each in taken] == pytest.approx([0.0, 0.5, 0.5, 7.5])
 
 

@@ -56,8 +56,7 @@ def test_throttling_is_logged_and_announced_and_marks_the_figures(make_flight, c
     flight = make_flight("hog")
     watch = SimpleNamespace(read=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
     meter = make_flight_meter(flight, watch=watch)
-    lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
-    boards = [line["board"] for line in select(lines, "query")]
+    boards = [line["board"] for line in select(flight.fly(FakeSource([PICTURE] * 6, clock), meter), "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))
     told = [each.temperature_core[0] for each in link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
     assert told[0] == 61

@@ -137,8 +137,7 @@ def test_odometry_frames_hold_the_position_between_queries_ten_seconds_apart():
 
 @pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT])
 def test_matches_need_two_to_overrule_a_tracked_path_if_rare(channel):
-    air = fly_no_gps(make_air(channel, **RARE), 60)
-    assert measure_offsets_m(air, 25)[1] < 15.0
+    assert measure_offsets_m(fly_no_gps(make_air(channel, **RARE), 60), 25)[1] < 15.0
 
 
 def fly_with_failing_compass(shows_turn, seed):

@@ -14,8 +14,7 @@ def make_place_map(altitudes_m, footprint_m=100.0, lens=None, is_surveyed=False)
     def places():
         pose = None
         if footprint_m:
-            covariance_m2 = 1.0, 0.0, 1.0
-            pose = Pose(up_deg=0.0, footprint_m=footprint_m, covariance_m2=covariance_m2, is_surveyed=is_surveyed)
+            pose = Pose(up_deg=0.0, footprint_m=footprint_m, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=is_surveyed)
         yield Place(place_id=0, source_image="unknown.jpg")
         for number, alt_m in enumerate(altitudes_m, 1):
             if alt_m == "damaged":

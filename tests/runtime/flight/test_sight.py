@@ -110,8 +110,7 @@ def test_sight_reports_a_flight_that_leaves_its_map_and_returns(make_flight, clo
     ],
 )
 def test_sight_reports_images_rotated_from_the_heading_once(notifier, link, rotation_deg, said):
-    source = load_config(None, {"source.up_deg": 300.0}).source
-    watch = TurnWatch(notifier, source)
+    watch = TurnWatch(notifier, load_config(None, {"source.up_deg": 300.0}).source)
     view = SimpleNamespace(up_deg=350.0, reason=None)
     events = [SimpleNamespace(located=SimpleNamespace(heading_deg=350.0 + turn), view=view) for turn in rotation_deg]
     missed = SimpleNamespace(located=None, view=view)

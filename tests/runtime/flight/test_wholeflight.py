@@ -82,8 +82,7 @@ def test_select_last_flight_accepts_a_repeated_start_line_after_a_storage_change
     whole = select_last_flight(path)
     assert [line["kind"] for line in whole] == ["start", "query", "query"]
     assert whole.missing is None
-    later = path.with_name("flight-0001.jsonl")
-    path.rename(later)
+    path.rename(path.with_name("flight-0001.jsonl"))
     path.write_text(json.dumps({**again, "part": 3}) + '\n{"kind": "query", "n": 3}\n')
     assert list_numbers(select_last_flight(path)) == [1, 2, 3]
     assert select_last_flight(path).missing is None

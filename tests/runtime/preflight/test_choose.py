@@ -16,13 +16,6 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import choose as choosing
-from edgevpr.runtime.preflight.choose import (
-    FlightPlan,
-    choose_best,
-    find_accuracy,
-    list_fewer_candidates,
-    make_option,
-)
 from edgevpr.runtime.preflight.probe import measure_costs
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
@@ -38,20 +31,20 @@ def accuracies(monkeypatch):
 
 def make_plan(places, rate_hz=1.0):
     battery = {"flight_min": 20.0, "pack": parse_pack("4S5200"), "regulator_efficiency": 0.85}
-    return FlightPlan(places=places, rate_hz=rate_hz, budget_mb=100, **battery)
+    return choosing.FlightPlan(places=places, rate_hz=rate_hz, budget_mb=100, **battery)
 
 
 def make_options(board, costs, places):
     plan = make_plan(places)
-    return [make_option(board, name, name, cost, plan) for name, cost in costs.items()]
+    return [choosing.make_option(board, name, name, cost, plan) for name, cost in costs.items()]
 
 
 def fit(board, costs, places, rate_hz=1.0):
-    return make_option(board, "regions", "regions", costs, make_plan(places, rate_hz))
+    return choosing.make_option(board, "regions", "regions", costs, make_plan(places, rate_hz))
 
 
 def choose_label(board, costs, places):
-    option = choose_best(make_options(board, costs, places))
+    option = choosing.choose_best(make_options(board, costs, places))
     return option and option.label
 
 
@@ -131,9 +124,8 @@ def test_choose_best_never_returns_one_that_accepted_wrong_places(accuracies):
 
 
 def test_match_scans_a_large_map_whole_and_compares_a_part_of_it():
-    two_stages = dataclasses.replace(
-        REGIONS, candidates=20, scan_per_place=StageCost(1e-6, 1e-6), scan_once=StageCost(0.03, 0.03)
-    )
+    scan = {"scan_per_place": StageCost(1e-6, 1e-6), "scan_once": StageCost(0.03, 0.03)}
+    two_stages = dataclasses.replace(REGIONS, candidates=20, **scan)
     for places in (4, 20, 21, 10_000):
         assert two_stages.match(places).wall_s == pytest.approx(0.03 + 0.004 * min(places, 20) + 1e-6 * places)
     turned = dataclasses.replace(two_stages, tries_rotations=True)
@@ -165,15 +157,15 @@ def test_make_option_refuses_rates_at_which_fixes_would_be_too_late():
 
 
 def test_find_accuracy_gives_the_figures_of_the_results():
-    assert list_fewer_candidates("cohog", "nadir") == list_fewer_candidates("cohog", None) == (20, 10)
+    assert choosing.list_fewer_candidates("cohog", "nadir") == choosing.list_fewer_candidates("cohog", None) == (20, 10)
     for camera in ("forward", "nadir"):
         for name in ("cohog", "hog 1bit", "seqslam", "netvlad 8bit"):
-            assert find_accuracy(name, camera).queries > 50
-        assert not find_accuracy("cohog", camera).accepted_elsewhere
+            assert choosing.find_accuracy(name, camera).queries > 50
+        assert not choosing.find_accuracy("cohog", camera).accepted_elsewhere
     results = Path(__file__).parents[3] / "benchmarks" / "results"
     recalls = []
     for name in ("grief_stromovka_seasons", "nordland_tiny"):
         table = json.loads((results / f"{name}.json").read_text())["rows"]
         rows = (dict(zip(table["columns"], row, strict=True)) for row in table["rows"])
         recalls.append(next(row["recall_at_1"] for row in rows if row["technique"] == "cohog"))
-    assert find_accuracy("cohog", "forward").recall_at_1 == pytest.approx(sum(recalls) / 2, abs=1e-4)
+    assert choosing.find_accuracy("cohog", "forward").recall_at_1 == pytest.approx(sum(recalls) / 2, abs=1e-4)

@@ -12,13 +12,12 @@ from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.preflight import choose
-from edgevpr.runtime.preflight.choose import FlightPlan
 from edgevpr.runtime.preflight.estimate import compute_counted_costs, estimate_flight
 from edgevpr.runtime.preflight.trial import Trial
 
 VECTOR = replace(ONE_CORE_VECTOR, encode=StageCost(0.05, 0.1), match_per_place=StageCost(0.001, 0.002))
 COSTS = {"regions": REGIONS, "vector": VECTOR}
-PLAN = FlightPlan(
+PLAN = choose.FlightPlan(
     places=100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
 PI = load_board("rpi-4b")
@@ -76,12 +75,7 @@ def test_estimate_uses_no_rate_beyond_reach():
     ("board", "times", "recommended", "notes"),
     [
         ("rpi-4b", "counted", "cohog", ("1741 million", "Raspberry Pi 4B")),
-        (
-            "rpi-zero-2w",
-            "counted",
-            "cohog",
-            ("838 million", "The costs", "The power"),
-        ),
+        ("rpi-zero-2w", "counted", "cohog", ("838 million", "The costs", "The power")),
         ("odroid-xu4", "unknown", None, ("cohog, vector", "8.5 W")),
         ("thesis-xeon", "unknown", None, ("run `edgevpr profile` on the board", "The power")),
     ],

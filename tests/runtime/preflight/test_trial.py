@@ -6,7 +6,6 @@ import signal
 import pytest
 
 from edgevpr.runtime.preflight import trial
-from edgevpr.runtime.preflight.trial import list_trials, run_trials
 
 
 def kill_hog_trial(trials, threads):
@@ -19,7 +18,7 @@ def kill_hog_trial(trials, threads):
 @pytest.mark.usefixtures("models")
 def test_run_trials_reports_a_process_that_dies_and_continues(monkeypatch):
     monkeypatch.setattr(trial, "_run_in_child", kill_hog_trial)
-    found = list(run_trials(list_trials({"hog": {}, "seqslam": {}}), threads=1))
+    found = list(trial.run_trials(trial.list_trials({"hog": {}, "seqslam": {}}), threads=1))
     assert [each.label for each in found] == ["hog", "seqslam"], "one row for all forms of what cannot be used"
     assert "crashed" in found[0].problem
     assert (found[0].costs, found[1].problem) == (None, None)

@@ -184,8 +184,7 @@ def test_compare_near_returns_another_overlay_supported_by_many_landmarks(as_exp
 def test_compare_near_ignores_displays_and_nearby_overlays():
     assert compare_near(*make_pair(make_circle(20)), Overlay((0.3, 0.0), 0.0, 1.0)).inliers == 0
     query, place = make_pair(make_circle(20), shift=0.05, rotation_deg=90.0)
-    wrong = replace(query, angle_deg=query.angle_deg + 90)
-    found = compare_near(wrong, place, Overlay((0.0, 0.0), 90.0, 1.0))
+    found = compare_near(replace(query, angle_deg=query.angle_deg + 90), place, Overlay((0.0, 0.0), 90.0, 1.0))
     assert (found.inliers, found.is_expected) == (0, True)
 
 

@@ -15,12 +15,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.calibration import (
-    MapCalibration,
-    format_calibration,
-    read_calibration_for,
-    require_usable,
-)
+from edgevpr.runtime.recognise import calibration
 from edgevpr.runtime.recognise.confidence import parse_model, read_default_model
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -28,7 +23,7 @@ from edgevpr.techniques import create
 
 SHIPPED = {kind: read_default_model(kind) for kind in ("ahead", "ahead_proven")}
 OWN_MODEL = replace(SHIPPED["ahead"], made_of="this map")
-CALIBRATION = MapCalibration(
+CALIBRATION = calibration.MapCalibration(
     models={"ahead": OWN_MODEL},
     made="2026-05-01",
     asked=120,
@@ -72,16 +67,16 @@ def fly_over_map(path):
 
 def test_flight_uses_the_calibrated_models_of_its_map(path, caplog):
     assert fly_over_map(path) == SHIPPED
-    write_calibration(path, format_calibration(CALIBRATION))
+    write_calibration(path, calibration.format_calibration(CALIBRATION))
     assert fly_over_map(path) == {**SHIPPED, "ahead": OWN_MODEL}, "an older edgevpr calibrated one of them"
     with PlaceMap.open(path) as place_map:
-        assert read_calibration_for(place_map) == CALIBRATION
+        assert calibration.read_calibration_for(place_map) == CALIBRATION
     assert not caplog.records
 
 
 def change_calibration(more=(), **figures):
     """The text of the calibration with `more` fields or other figures of its model, and its checksum."""
-    stored = json.loads(format_calibration(CALIBRATION)[8:])
+    stored = json.loads(calibration.format_calibration(CALIBRATION)[8:])
     stored["models"]["ahead"].update(more)
     stored["models"]["ahead"]["of_map"].update(figures)
     body = json.dumps(stored)
@@ -91,13 +86,13 @@ def change_calibration(more=(), **figures):
 DAMAGED = {
     "empty": "",
     "no json": "deadbeef{",
-    "changed": format_calibration(CALIBRATION).replace("2026", "2025"),
+    "changed": calibration.format_calibration(CALIBRATION).replace("2026", "2025"),
     "evidence that there is not": change_calibration(names=["colour", *OWN_MODEL.of_map.names[1:]]),
-    "a kind that there is not": format_calibration(replace(CALIBRATION, models={"sideways": OWN_MODEL})),
+    "a kind that there is not": calibration.format_calibration(replace(CALIBRATION, models={"sideways": OWN_MODEL})),
     "a weight too few": change_calibration(weights=OWN_MODEL.of_map.weights[1:]),
     "a field of another version": change_calibration({"of_other_places": []}),
-    "a place that is no number": format_calibration(replace(CALIBRATION, recognisable={"x": 0.5})),
-    "no places": format_calibration(replace(CALIBRATION, recognisable=None)),
+    "a place that is no number": calibration.format_calibration(replace(CALIBRATION, recognisable={"x": 0.5})),
+    "no places": calibration.format_calibration(replace(CALIBRATION, recognisable=None)),
     "a wrong surrogate": "\ud800" * 9,
 }
 
@@ -115,7 +110,7 @@ def test_flight_uses_the_default_model_and_reports_a_damaged_calibration(path, t
 @pytest.mark.parametrize("kind", MAP_FIGURES)
 def test_default_model_gives_a_probability_for_any_evidence(kind):
     model = read_default_model(kind)
-    require_usable(kind, model)
+    calibration.require_usable(kind, model)
     assert parse_model(json.loads(json.dumps(asdict(model)))) == model
     evidence = dict.fromkeys(MAP_FIGURES[kind] + PLACE_FIGURES[kind], 0.0)
     for value in (-3.0, -1.0, 0.0, 1.0, 3.0):

@@ -60,10 +60,8 @@ def maps(ground, lenses, tmp_path_factory):
         write_positions(folder / "positions.csv", tags)
         made[name] = str(folder / "map.gpkg")
         pictures = FlightPictures(source=str(folder))
-        parameters = {"camera": "nadir"}
-        order = MapPlan(
-            path=made[name], pictures=pictures, technique="cohog", parameters=parameters, refine=False, calibrate=False
-        )
+        asked = {"technique": "cohog", "parameters": {"camera": "nadir"}, "refine": False, "calibrate": False}
+        order = MapPlan(path=made[name], pictures=pictures, **asked)
         make_map(order, load_config(None, {"source.lens": lenses[name]}), pytest.fail, lambda all_, *_: all_)
     return made
 

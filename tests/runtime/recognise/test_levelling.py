@@ -50,8 +50,7 @@ def frame(ground, place, t_mono_s=0.0, told=None, **pose):
     light = Light(sun_azimuth_deg=0, sun_elevation_deg=60)
     image = photograph(ground, 0.25, where, CAMERA, light, np.random.default_rng(0))
     position = Position(50 + where.north_m / M_PER_DEG, 8.0)
-    known = pose if told is None else told
-    return Frame(image=image, name=f"{place}", t_mono_s=t_mono_s, position=position, **known)
+    return Frame(image=image, name=f"{place}", t_mono_s=t_mono_s, position=position, **(pose if told is None else told))
 
 
 @pytest.fixture(scope="module")
@@ -166,9 +165,8 @@ def test_prepare_refuses_too_large_a_tilt_and_reports_it_once(walk, ground, capl
 
 def test_centre_place_has_the_position_of_the_image_centre():
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0, 300.0))
-    east = centre_place(
-        at, View(up_deg=90.0, footprint_m=100.0, nadir_offset=(0.0, -0.3))
-    )  # the aircraft is west of the middle
+    # The aircraft is west of the middle.
+    east = centre_place(at, View(up_deg=90.0, footprint_m=100.0, nadir_offset=(0.0, -0.3)))
     assert east.position.lon_deg == pytest.approx(8.0 + 30 / (M_PER_DEG * math.cos(math.radians(50))), abs=1e-7)
     assert east.position.lat_deg == pytest.approx(50.0, abs=1e-9)
     assert (east.position.alt_m, east.heading_deg) == (300.0, 90.0)

@@ -28,9 +28,8 @@ def make_candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0
 
 
 def measure_offset_m(position):
-    east_m, north_m = project_to_metres(
-        np.array([ORIGIN.lat_deg, position.lat_deg]), np.array([ORIGIN.lon_deg, position.lon_deg])
-    )
+    lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in (ORIGIN, position)]).T
+    east_m, north_m = project_to_metres(lat_deg, lon_deg)
     return east_m[1], north_m[1]
 
 

@@ -56,8 +56,7 @@ def test_the_next_frame_is_due_when_a_tenth_of_the_view_has_moved_on(ground):
 def test_odometry_measures_the_displacement_of_the_aircraft(ground, change):
     second = replace(START, **change)
     found = measure_odometry(take_view(ground, START), take_view(ground, second))
-    gone_m = second.east_m - START.east_m, second.north_m - START.north_m
-    assert found.moved_m == pytest.approx(gone_m, abs=0.5)
+    assert found.moved_m == pytest.approx((second.east_m - START.east_m, second.north_m - START.north_m), abs=0.5)
     assert (found.from_s, found.to_s) == (5.0, 6.0)
     assert found.sd_m < 0.5
 

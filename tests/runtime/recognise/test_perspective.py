@@ -93,13 +93,11 @@ def ground():
 @pytest.mark.parametrize(("roll_deg", "pitch_deg", "told_deg"), [(3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (15.0, 2.0, 13.0)])
 def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_deg, pitch_deg, told_deg):
     place = take_level_view(ground, CameraPose(east_m=160.0, north_m=140.0, height_m=100.0, heading_deg=0.0))
-    pose = CameraPose(
-        east_m=168.0, north_m=134.0, height_m=102.0, heading_deg=40.0, roll_deg=roll_deg, pitch_deg=pitch_deg
-    )
+    attitude = {"heading_deg": 40.0, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+    pose = CameraPose(east_m=168.0, north_m=134.0, height_m=102.0, **attitude)
     query = take_level_view(ground, pose, replace(pose, roll_deg=told_deg, pitch_deg=0.0))
-    found = measure_agreement(
-        detect_landmarks(query.image, query.mask, QUERY_LANDMARKS), detect_landmarks(place.image, place.mask)
-    )
+    landmarks = detect_landmarks(query.image, query.mask, QUERY_LANDMARKS)
+    found = measure_agreement(landmarks, detect_landmarks(place.image, place.mask))
     lean = fit_attitude_error(*found.inlier_points, query.view, found.rotation_deg)
     # The left wing is up: the camera looks to the left, and the aircraft is right of where it is taken to be.
     right, ahead = (math.tan(math.radians(each)) for each in (roll_deg - told_deg, -pitch_deg))

@@ -82,9 +82,8 @@ class Flight:
             number = int(self.index.place_ids[best])
             position = to_position(place)
             where = Located(position=position, covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
-        return self.follower.update(
-            Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where, VIEW
-        )
+        ranking = Ranking(slots=slots, scores=scores, compared=compared)
+        return self.follower.update(ranking, self.index, evidence, rule, where, VIEW)
 
     def query(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
         self.advance(elapsed_s, velocity_m_s, moved_m)

@@ -13,12 +13,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.mapmaking.mapping import PlaceSelector
 from edgevpr.runtime.recognise.encoder import EncodedFrame
 from edgevpr.runtime.recognise.gate_networks import interpolate_map
-from edgevpr.runtime.recognise.salience_gate import (
-    SalienceGate,
-    SalienceVerdict,
-    compute_scores,
-    judge_scores,
-)
+from edgevpr.runtime.recognise.salience_gate import SalienceGate, SalienceVerdict, compute_scores, judge_scores
 from edgevpr.techniques.entropy import compute_filled_bins
 
 RNG = np.random.default_rng(5)
@@ -81,8 +76,7 @@ def test_salience_gate_requires_less_entropy_in_bad_light():
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
     by_day, at_night = SalienceGate(make_config(entropy=0.4)), SalienceGate(make_config(entropy=0.4))
     assert all(by_day.judge(picture).reason is None for picture in day)
-    passed = [at_night.judge(picture).reason is None for picture in night]
-    assert sum(passed) >= 36
+    assert sum([at_night.judge(picture).reason is None for picture in night]) >= 36
     assert at_night.judge(np.full((120, 160), 3, np.uint8)).criterion == "entropy"
 
 

@@ -53,7 +53,6 @@ def test_step_accepts_any_other_place_without_a_heading(walk):
 def test_step_loses_one_query_to_a_wrong_compass(make_walk):
     """The next finds its place without the heading, as do the others until a place is found that agrees with it."""
     walk = make_walk(prior=Prior(None, WITHIN_DEG, is_live=False))
-    headings_deg = {0: 0.0, 1: 150.0, 3: 150.0}
-    events = [walk.step(frame(place, 40, heading_deg)) for place, heading_deg in headings_deg.items()]
+    events = [walk.step(frame(place, 40, heading_deg)) for place, heading_deg in {0: 0.0, 1: 150.0, 3: 150.0}.items()]
     assert [event.accepted for event in events] == [True, False, True]
     assert [event.hints is not None for event in events] == [True, True, False]

@@ -179,11 +179,7 @@ def make_bare_frame(seed, right_px=0, down_px=0):
 def overlapping(tmp_path_factory, technique):
     """Places without positions: the first, the fifth and the eighth show the same ground."""
     same, other = (
-        [
-            make_bare_frame(1, -25, -10),
-            make_bare_frame(1, 25, 10),
-            make_bare_frame(1, 0, 28),
-        ],
+        [make_bare_frame(1, -25, -10), make_bare_frame(1, 25, 10), make_bare_frame(1, 0, 28)],
         list(map(make_bare_frame, range(2, 7))),
     )
     order = [same[0], *other[:3], same[1], *other[3:], same[2]]

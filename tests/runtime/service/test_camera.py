@@ -14,7 +14,6 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 from edgevpr.runtime.service import camera
-from edgevpr.runtime.service.camera import check_camera, check_frame
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 
@@ -37,11 +36,11 @@ def rpicam(tmp_path, monkeypatch):
 @pytest.mark.process
 @pytest.mark.usefixtures("rpicam")
 def test_check_camera_lists_the_cameras_on_the_ribbon(root, monkeypatch):
-    (finding,) = check_camera("rpicam", root)
+    (finding,) = camera.check_camera("rpicam", root)
     assert (finding.ok, finding.reason.parameters["camera"]) == (True, "imx219")
-    assert next(check_camera("rpicam:1", root)).reason.parameters["cameras"] == "0"
+    assert next(camera.check_camera("rpicam:1", root)).reason.parameters["cameras"] == "0"
     monkeypatch.setenv("FAKE_RPICAM", "absent")
-    (finding,) = check_camera("rpicam", root)
+    (finding,) = camera.check_camera("rpicam", root)
     assert (finding.ok, finding.reason.code) == (False, FindingCode.CAMERA_NOT_LISTED)
 
 
@@ -49,23 +48,23 @@ def test_check_camera_lists_the_cameras_on_the_ribbon(root, monkeypatch):
 def test_check_camera_finds_a_device_of_the_ribbon_without_access(root, monkeypatch):
     access = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: "dma_heap" not in str(path) and access(path, mode))
-    (finding,) = check_camera("rpicam", root)
+    (finding,) = camera.check_camera("rpicam", root)
     assert (finding.ok, finding.reason.parameters["path"]) == (False, "/dev/dma_heap/linux,cma")
 
 
 @pytest.mark.parametrize("uri", ["rpicam", "gst: v4l2src ! appsink"])
 def test_check_camera_finds_a_missing_program(root, monkeypatch, uri):
     monkeypatch.setenv("PATH", str(root))
-    (finding,) = check_camera(uri, root)
+    (finding,) = camera.check_camera(uri, root)
     assert (finding.ok, finding.reason.code) == (False, ReasonCode.UNUSABLE)
 
 
 def test_check_camera_finds_a_program_that_has_it_open(root):
-    assert next(check_camera("/dev/video0", root)).ok
+    assert next(camera.check_camera("/dev/video0", root)).ok
     (root / "proc/812/fd").mkdir(parents=True)
     (root / "proc/812/stat").write_text("812 (guvcview) S 1 812 812 0 -1 4194304")
     (root / "proc/812/fd/7").symlink_to("/dev/null")
-    assert next(check_camera("/dev/video0", root)).reason.parameters["program"] == "guvcview (process 812)"
+    assert next(camera.check_camera("/dev/video0", root)).reason.parameters["program"] == "guvcview (process 812)"
 
 
 def test_check_frame_compares_the_frame_with_the_lens(tmp_path):
@@ -75,11 +74,11 @@ def test_check_frame_compares_the_frame_with_the_lens(tmp_path):
     grey = np.zeros((480, 640), np.uint8)
     cv2.imwrite(str(folder / "1.png"), grey)
     source = load_config(None, {"source.uri": str(folder), "source.lens": lens}).source
-    found = check_frame("source", source).reason.parameters
+    found = camera.check_frame("source", source).reason.parameters
     assert (found["width"], found["height"], found["lens"], round(found["fov_deg"])) == (640, 480, lens, 99)
     cv2.imwrite(str(folder / "1.png"), grey[60:420])
     with pytest.raises(ImageError, match="640x360"):
-        check_frame("source", source)
+        camera.check_frame("source", source)
 
 
 def test_check_frame_refuses_both_pictures_of_a_stereo_pair(monkeypatch):
@@ -93,4 +92,4 @@ def test_check_frame_refuses_both_pictures_of_a_stereo_pair(monkeypatch):
 
     monkeypatch.setattr(camera, "open_source", lambda *_, **__: Stereo())
     with pytest.raises(ImageError, match="both halves"):
-        check_frame("source", load_config(None, {"source.uri": "tcp://127.0.0.1:1"}).source)
+        camera.check_frame("source", load_config(None, {"source.uri": "tcp://127.0.0.1:1"}).source)

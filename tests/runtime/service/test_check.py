@@ -18,7 +18,6 @@ from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import check
-from edgevpr.runtime.service.check import Finding, check_configuration
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -53,10 +52,10 @@ def config_file(tmp_path) -> Path:
     return tmp_path / "config.yaml"
 
 
-def find_offline_faults(config_file: Path, settings: dict) -> list[Finding]:
+def find_offline_faults(config_file: Path, settings: dict) -> list[check.Finding]:
     """What `check` finds wrong without an autopilot and without waiting for a frame."""
     config_file.write_text(yaml.safe_dump(settings))
-    findings = check_configuration(config_file, offline=True)
+    findings = check.check_configuration(config_file, offline=True)
     assert [finding.what for finding in findings] == ITEMS
     return [finding for finding in findings if not finding.ok]
 
@@ -73,7 +72,7 @@ def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(setting
 @pytest.mark.parametrize(("board", "is_other"), [("this", False), ("thesis-xeon", True)])
 def test_check_reports_a_query_time_not_measured_on_the_board(settings, config_file, board, is_other):
     config_file.write_text(yaml.safe_dump(settings | {"board": board}))
-    (finding,) = (each for each in check_configuration(config_file, offline=True) if each.what == "map")
+    (finding,) = (each for each in check.check_configuration(config_file, offline=True) if each.what == "map")
     assert finding.reason.parameters["t_query_s"] > 0
     assert finding.reason.parameters["machine"].endswith(f", not on {load_board(board).title}") == is_other
 
@@ -100,7 +99,7 @@ def test_check_leaves_no_files(settings, config_file, tmp_path, flight_folder):
 def test_check_stops_at_an_unreadable_configuration(config_file, text):
     if text is not None:
         config_file.write_text(text)
-    (finding,) = check_configuration(config_file)
+    (finding,) = check.check_configuration(config_file)
     assert (finding.what, finding.ok) == ("configuration", False)
     assert str(config_file) in finding.reason.parameters["problem"]
 
@@ -128,7 +127,7 @@ def test_check_finds_faults_offline(settings, config_file, changes, wrong_things
 
 def test_check_of_an_unknown_board_does_not_open_the_map(settings, config_file):
     config_file.write_text(yaml.safe_dump(settings | {"board": "rpi-zero-2"}))
-    findings = {finding.what: finding.ok for finding in check_configuration(config_file, offline=True)}
+    findings = {finding.what: finding.ok for finding in check.check_configuration(config_file, offline=True)}
     assert not findings["board"]
     assert "map" not in findings
 
@@ -142,14 +141,14 @@ def test_check_reports_places_beyond_the_budget(settings, config_file):
         while len(place_map) * technique.spec.coarse.nbytes < 1e6:
             place_map.add(frame, descriptor)
     config_file.write_text(yaml.safe_dump(settings | {"map": str(big), "memory": {"budget_mb": 1}}))
-    (finding,) = (each for each in check_configuration(config_file, offline=True) if each.what == "map")
+    (finding,) = (each for each in check.check_configuration(config_file, offline=True) if each.what == "map")
     assert re.search(r"\b[1-9]\d* places ", finding.reason.parameters["technique"])
 
 
-def find_online_faults(config_file: Path, settings: dict) -> list[Finding]:
+def find_online_faults(config_file: Path, settings: dict) -> list[check.Finding]:
     """What `check` finds wrong when it waits for a frame and a heartbeat."""
     config_file.write_text(yaml.safe_dump(settings))
-    return [finding for finding in check_configuration(config_file) if not finding.ok]
+    return [finding for finding in check.check_configuration(config_file) if not finding.ok]
 
 
 def start_autopilot(settings: dict, **how) -> AnsweringAutopilot:

@@ -155,9 +155,8 @@ def test_check_autopilot_accepts_unknown_values():
 
 
 def test_check_autopilot_wants_a_faster_line():
-    assert find_faults(replace(COPTER, round_trip_s=0.4), SERIAL) == {
-        "link": ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")
-    }
+    changes = ("SERIALn_PROTOCOL=2", "SERIALn_BAUD=921")
+    assert find_faults(replace(COPTER, round_trip_s=0.4), SERIAL) == {"link": changes}
     px4_changes = ("MAV_1_CONFIG=102", "MAV_1_MODE=2", "SER_TEL2_BAUD=921600")
     assert find_faults(replace(PX4, round_trip_s=0.4), SERIAL) == {"link": px4_changes}
 
@@ -217,9 +216,8 @@ def test_check_autopilot_wants_odometry_of_a_px4_without_message_296():
 
 
 def test_check_autopilot_finds_an_old_px4():
-    assert find_faults(replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})) == {
-        "firmware": ()
-    }
+    old = replace(PX4, vehicle="plane", version=(1, 14, 3), version_text="1.14.3", parameters={})
+    assert find_faults(old) == {"firmware": ()}
     assert set(find_faults(replace(PX4, version=None))) == {"firmware"}
     assert find_faults(replace(PX4, sends_mavlink1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 

@@ -85,9 +85,8 @@ def test_run_ends_the_program_of_a_camera(recording, tmp_path):
     path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     flight = start(recording / "cohog.gpkg", "gst: v4l2src", tmp_path / "f.jsonl", PATH=path)
     try:
-        (child,) = wait_until(
-            lambda: [each for each in psutil.Process(flight.pid).children() if "600.25" in each.cmdline()]
-        )
+        process = psutil.Process(flight.pid)
+        (child,) = wait_until(lambda: [each for each in process.children() if "600.25" in each.cmdline()])
         flight.terminate()
         assert flight.wait(END_S) == 0
         wait_until(lambda: not child.is_running())
