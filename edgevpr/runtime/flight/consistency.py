@@ -22,6 +22,7 @@ _CONFIRMATION_TIMEOUT_S = 2.5
 _DRIFT_M_S = 2.5  # path drift allowed between two fixes that agree
 _TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
 _FIXES_TO_OVERRULE_TRACK = 4
+_MAX_SUPPORT = 20
 _MAX_ROUTE_INTERVAL_S = 10.0
 _MAX_SPEED_M_S = 30.0
 _MAX_UNPREDICTED_INTERVAL_S = 120.0  # between two matches that nothing predicts
@@ -64,9 +65,14 @@ class Consistency:
     The path drifts slowly, so only another fix can show whether a distant fix or the path is wrong. Two correct fixes
     have the same offset from the path; two wrong ones hardly ever do. If the path error exceeds drift, correct fixes
     disagree too: then four fixes at different places are accepted, if an aircraft could have flown from each to the
-    next. Four are also needed where visual odometry tracks the path: repetitive ground can repeat a wrong fix."""
+    next. Four are also needed where visual odometry tracks the path: repetitive ground can repeat a wrong fix. Even
+    four may be wrong: until as many fixes support the new path as supported the overruled one (at most 20, also for
+    GPS), it is in doubt, and a single fix where the other one leads returns to that."""
 
     def __init__(self) -> None:
+        self._support = 0  # fixes since the path began or overruled another one
+        self._overruling: PredictedFix | None = None  # the last fix that overruled a tracked path, which may be right
+        self._overruled_support = 0
         self._agreeing: list[PredictedFix] = []  # held fixes: one, and later ones that agree with it
         self._heading_error_deg: float | None = None  # compass error of the last accepted fix
         self._flyable: list[PredictedFix] = []  # held fixes at different places, along a route that can be flown
@@ -77,12 +83,24 @@ class Consistency:
         timeout_s = _CONFIRMATION_TIMEOUT_S if is_tracked else _HELD_FIX_TIMEOUT_S
         return bool(self._agreeing) and now_s - self._agreeing[-1].match.t_s <= timeout_s
 
+    @property
+    def doubt_m(self) -> float:
+        """Distance to the position on the path that was overruled, while that may be right; otherwise 0."""
+        return float(np.hypot(*self._overruling.innovation_m)) if self._overruling else 0.0
+
+    def trust_path(self) -> None:
+        """Process a position of GPS that supports the path."""
+        self._support, self._overruling = _MAX_SUPPORT, None
+
     def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
         """Gate a fix by its innovation. `has_gps`: of the autopilot, and trusted; `is_tracked`: by visual odometry."""
         match, innovation_m = fix.match, fix.innovation_m
         heading_agrees = match.heading_agrees_with(self._heading_error_deg)
-        sigmas = mahalanobis(innovation_m, match.covariance_m2 + fix.covariance_m2)
-        if sigmas <= _MAX_INNOVATION_SIGMA and heading_agrees:
+        covariance_m2 = match.covariance_m2 + fix.covariance_m2
+        if mahalanobis(innovation_m, covariance_m2) <= _MAX_INNOVATION_SIGMA and heading_agrees:
+            self._support = min(_MAX_SUPPORT, self._support + 1)
+            if self._support >= self._overruled_support:
+                self._overruling = None
             return self._accept(fix, ACCEPTED)
         error_m, predicted_sd_m = math.hypot(*innovation_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
         wrong_heading = Reason(ReasonCode.HELD_ROTATED, {"rotation_deg": match.heading_error_deg or 0.0})
@@ -90,22 +108,33 @@ class Consistency:
             self._agreeing, self._flyable = [], []
             off_gps = Reason(ReasonCode.HELD_OFF_GPS, {"distance_m": error_m})
             return GateResult(off_gps if heading_agrees else wrong_heading)
+        if (overruling := self._overruling) and heading_agrees:
+            covariance_m2 = covariance_m2 + overruling.covariance_m2
+            if mahalanobis(innovation_m + overruling.innovation_m, covariance_m2) <= _MAX_INNOVATION_SIGMA:
+                self._support, self._overruling = self._overruled_support, None
+                return self._accept(fix, GateResult(overrules_path=True))
         self._flyable = [held for held in self._flyable if _is_flyable(held, fix)]
         if all(match.shares_no_place_with(held.match) for held in self._flyable):  # neighbours share places
             self._flyable.append(fix)
-        if len(self._flyable) == _FIXES_TO_OVERRULE_TRACK:
-            return self._accept(fix, GateResult(overrules_path=True, restarts_path=True))
-        if not heading_agrees:
-            return GateResult(wrong_heading)
         drift_m_s = _TRACKED_DRIFT_M_S if is_tracked else _DRIFT_M_S
-        if self._agreeing and _compute_distance(self._agreeing[0], fix, drift_m_s) <= _MAX_DISAGREEMENT_SIGMA:
+        first = self._agreeing[0] if self._agreeing and heading_agrees else None
+        if first and _compute_distance(first, fix, drift_m_s) <= _MAX_DISAGREEMENT_SIGMA:
             self._agreeing.append(fix)
             is_enough = not is_tracked or len(self._agreeing) >= _FIXES_TO_OVERRULE_TRACK
-            if is_enough and _is_independent(self._agreeing[0], fix, drift_m_s):
-                return self._accept(fix, GateResult(overrules_path=True))
-        else:
+            if is_enough and _is_independent(first, fix, drift_m_s):
+                return self._overrule(fix, is_tracked)
+        elif heading_agrees:
             self._agreeing = [fix]
+        if len(self._flyable) == _FIXES_TO_OVERRULE_TRACK:
+            return self._overrule(fix, is_tracked, restarts_path=True)
+        if not heading_agrees:
+            return GateResult(wrong_heading)
         return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"distance_m": error_m, "accuracy_m": predicted_sd_m}))
+
+    def _overrule(self, fix: PredictedFix, is_tracked: bool, restarts_path: bool = False) -> GateResult:
+        self._overruling = fix if is_tracked else None
+        self._support, self._overruled_support = 0, self._support
+        return self._accept(fix, GateResult(overrules_path=True, restarts_path=restarts_path))
 
     def _accept(self, fix: PredictedFix, verdict: GateResult) -> GateResult:
         self._agreeing, self._flyable = [], []

@@ -56,7 +56,7 @@ _SCALE_TOLERANCE = 0.02
 # the gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute. A
 # smaller factor would be closer to the true error, but makes the loop unstable: benchmarks/results/loop.md.
 CORRELATION_FACTOR = math.sqrt(50)
-_PX4_CORRELATION_FACTOR = 1.5
+PX4_CORRELATION_FACTOR = 1.0  # while our errors do not follow from its own: then its loop is stable with any
 _ATTITUDE_ERROR_VALID_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
 # PX4 refuses positions that are farther from its own than three (EKF2_AGP0_GATE) of the claimed and its own standard
@@ -164,6 +164,8 @@ class Navigator(Listener):
             navigation.doubt_heading(math.radians(step_deg), vehicle.t_received_s)
         self._vehicle = vehicle
         navigation.add_report(vehicle, self._trusts_gps)
+        if navigation.has_gps:
+            self._consistency.trust_path()
         self._watch.update(vehicle, navigation.last_fix_s, navigation.has_gps)
         if navigation.path_velocity_m_s is not None:
             velocity_m_s, error = navigation.path_velocity_m_s, self._choose_velocity_error()
@@ -183,7 +185,7 @@ class Navigator(Listener):
 
     def is_out_of_reach(self, event: Recognition) -> bool:
         """Return True if a match is so far from our position that no delay of its image explains it: it is wrong."""
-        estimate = self._navigation.estimate_state(event.frame.t_mono_s) if event.frame else None
+        estimate = self._estimate_state(event.frame.t_mono_s) if event.frame else None
         if estimate is None or event.located is None or not self._navigation.is_confirmed:
             return False
         way_m = _MAX_DELAY_S * max(_MIN_SPEED_M_S, math.hypot(*estimate.velocity_m_s))
@@ -253,7 +255,7 @@ class Navigator(Listener):
 
     def accuracy_m(self, now_s: float) -> float | None:
         """Return the accuracy of the position: metres, standard deviation of one axis (None: position unknown)."""
-        estimate = self._navigation.estimate_state(now_s)
+        estimate = self._estimate_state(now_s)
         if estimate is None or not self._navigation.is_confirmed:
             return None
         return self._compute_claimed_m(estimate)
@@ -350,8 +352,14 @@ class Navigator(Listener):
         ratio = self._height_ratio
         return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_doubt=doubt)
 
+    def _estimate_state(self, t_s: float) -> NavState | None:
+        """Return position and velocity at `t_s`; None if unknown. While two positions are possible, their distance is
+        included in the accuracy."""
+        estimate, doubt_m = self._navigation.estimate_state(t_s), self._consistency.doubt_m
+        return estimate and replace(estimate, accuracy_m=math.hypot(estimate.accuracy_m, doubt_m))
+
     def _estimate(self, t_s: float) -> NavState | None:
-        estimate = self._navigation.estimate_state(t_s)
+        estimate = self._estimate_state(t_s)
         max_error_m = _MAX_CONTINUOUS_ERROR_M if self._channel.is_continuous else _MAX_ERROR_M
         if estimate is None or self._compute_accuracy_m(estimate) > max_error_m:
             return None
@@ -373,7 +381,7 @@ class Navigator(Listener):
             return _withhold(ReasonCode.HAS_GPS if self._trusts_gps else ReasonCode.HAS_WRONG_GPS)
         if self._distrusts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)
-        estimate = self._navigation.estimate_state(now_s)
+        estimate = self._estimate_state(now_s)
         if estimate is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
         if not self._navigation.is_confirmed:
@@ -395,13 +403,13 @@ class Navigator(Listener):
         return Advice(Fix(*sent_deg, math.hypot(claimed_m, math.hypot(*lead_m) / math.sqrt(2)), now_s))
 
     def _correlation_factor(self, vehicle: Vehicle, t_s: float) -> float:
-        """Return the factor for the claimed errors of a continuous position. For PX4 it is small while pictures measure
-        its attitude error, or need no attitude: then our positions do not feed back into our own errors. Nor do they
-        while the autopilot has no position; ArduPilot then needs claims below 5 m and 1 m/s for ten seconds."""
+        """Return the factor for the claimed errors of a continuous position. For PX4 it is 1 while pictures measure its
+        attitude error, or need no attitude: then our positions do not feed back into our own errors. Nor do they while
+        the autopilot has no position; ArduPilot then needs claims below 5 m and 1 m/s for ten seconds."""
         if not vehicle.has_position:
             return 1.0
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
-        return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
+        return PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 
     def _compute_usable_accuracy_m(self, vehicle: Vehicle, lat_deg: float, lon_deg: float, t_s: float) -> float:
         """Return the smallest accuracy with which PX4 uses a position that matches prove; 0 if it need not."""

@@ -103,6 +103,35 @@ def test_consistency_accepts_a_fix_that_others_confirm_within_limits(fixes, is_t
     assert "".join(map(abbreviate, results)) == verdicts
 
 
+def judge_track(judge, off_m, predicted_m, times):
+    """Judge fixes at different places off to the east, once a second, on a tracked path."""
+    fixes = [make_fix(off_m, second, second, predicted_m=predicted_m) for second in range(times)]
+    return "".join(abbreviate(judge.judge(fix, has_gps=False, is_tracked=True)) for fix in fixes)
+
+
+@pytest.mark.parametrize(("supported", "doubted"), [(3, 3), (30, 20)])
+def test_consistency_doubts_a_new_track_until_as_many_fixes_support_it(supported, doubted):
+    judge = Consistency()
+    assert judge_track(judge, 0, 0, supported) + judge_track(judge, 100, 0, 4) == supported * "." + "hhha"
+    assert judge_track(judge, 100, 100, doubted - 1) == (doubted - 1) * "."
+    assert judge.doubt_m == 100
+    assert judge_track(judge, 100, 100, 1) + judge_track(judge, 0, 100, 1) == ".h"
+    assert judge.doubt_m == 0
+
+
+def test_consistency_returns_to_a_track_in_doubt_at_the_first_fix_there():
+    judge = Consistency()
+    judge_track(judge, 0, 0, 9)
+    for _ in range(2):
+        assert judge_track(judge, 100, 0, 4) + judge_track(judge, 100, 100, 5) == "hhha....."
+        assert judge_track(judge, 12, 100, 1) + judge_track(judge, 0, 12, 1) == "a."
+        assert judge.doubt_m == 0
+    assert judge_track(judge, -100, 0, 4) == "hhha"
+    judge.trust_path()
+    assert judge.doubt_m == 0, "GPS supports it"
+    assert judge_track(judge, 0, -100, 1) == "h"
+
+
 def test_consistency_rejects_any_fix_against_gps():
     judge = Consistency()
     for second in range(6):

@@ -180,9 +180,9 @@ def test_fallback_position_has_the_altitude_of_the_receiver(sd_m, alt_m, sent_m)
     ("channel", "how", "shown_ago_s", "factor"),
     [
         (Channel.SENSOR, {}, None, INFLATION),
-        (Channel.SENSOR, {"is_level": True}, None, 1.5),
+        (Channel.SENSOR, {"is_level": True}, None, 1.0),
         (Channel.GPS_INPUT, {"is_level": True}, None, INFLATION),
-        (Channel.SENSOR, {}, 5.0, 1.5),
+        (Channel.SENSOR, {}, 5.0, 1.0),
         (Channel.SENSOR, {}, 5.1, INFLATION),
     ],
 )

@@ -277,6 +277,17 @@ def test_gps_that_comes_back_wrong_does_not_outweigh_matches():
     assert flight.fly(20).worst_m(flight.now_s - 24)[0] < 20, "17 without edgevpr"
 
 
+@pytest.mark.parametrize(("vehicle", "channel", "away_m"), [("arducopter", GPS_INPUT, 8), ("px4-copter", SENSOR, 20)])
+def test_places_that_look_alike_for_nine_seconds_move_no_aircraft(vehicle, channel, away_m):
+    flight = ClosedLoop(vehicle, velocity_m_s=5j, **channel).fly(25)
+    since_s = flight.set("SIM_GPS1_ENABLE", 0).fly(15).now_s
+    for map_off_m in (60, 0, -60, 0):
+        flight.map_off_m = map_off_m
+        flight.fly(9)
+    assert flight.worst_m(since_s)[0] < away_m, "80 m and more if four matches that agree are believed at once"
+    assert flight.positions_sent(flight.now_s - 1)
+
+
 def test_px4_is_given_proven_positions_that_it_does_not_refuse():
     flight = ClosedLoop("px4-copter", **SENSOR)
     flight.show_tilt = True
