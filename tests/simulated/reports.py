@@ -31,17 +31,16 @@ def _heartbeat(brain: Firmware) -> Message:
 
 
 def _position(brain: Firmware) -> Message | None:
-    """Report the position: without one ArduPilot reports 0, 0 (`send_global_position_int`), and PX4 nothing."""
-    if brain.origin is None or not brain.motion.is_known:
-        is_px4 = brain.number == mavlink.MAV_AUTOPILOT_PX4
-        return None if is_px4 else mavlink.MAVLink_global_position_int_message(_boot_ms(brain), *[0] * 7, _UNKNOWN_16)
-    truth, (lat_deg, lon_deg), velocity_m_s = brain.truth, brain.point, brain.velocity_m_s
+    """Report the position: without one ArduPilot reports 0, 0, 0 and a true height above home, and PX4 nothing."""
+    has_position = brain.origin is not None and brain.motion.is_known
+    if not has_position and brain.number == mavlink.MAV_AUTOPILOT_PX4:
+        return None
+    truth, point, velocity_m_s = brain.truth, brain.point, brain.velocity_m_s
+    position = [round(point[0] * 1e7), round(point[1] * 1e7), round(truth.alt_m * 1e3)]
     ned_m_s = velocity_m_s.imag, velocity_m_s.real, -truth.climb_m_s
     return mavlink.MAVLink_global_position_int_message(
         _boot_ms(brain),
-        round(lat_deg * 1e7),
-        round(lon_deg * 1e7),
-        round(truth.alt_m * 1e3),
+        *(position if has_position else [0, 0, 0]),
         0 if math.isnan(truth.height_m) else round(truth.height_m * 1e3),
         *(max(-_MAX_CM_S, min(_MAX_CM_S, round(100 * speed_m_s))) for speed_m_s in ned_m_s),
         _UNKNOWN_16 if math.isnan(truth.heading_deg) else round(math.degrees(_compute_yaw(brain)) * 100) % 36_000,
