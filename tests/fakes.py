@@ -139,8 +139,8 @@ def make_output(
 
 class FakeLink:
     """A link of which nothing gets lost, to an autopilot that listens from when it has an `answer` to fixes (None: it
-    is not there) and says what `vehicle` gives (None: that it has no position). `sent` is what has left, in order; no
-    text waits for its turn. `wish` stands for a command of the ground, which gets its answer."""
+    is not there) and says what `report_vehicle` gives (None: that it has no position). `sent` is what has left, in
+    order; no text waits for its turn. `wish` stands for a command of the ground, which gets its answer."""
 
     def __init__(
         self,
@@ -149,17 +149,17 @@ class FakeLink:
         answer: str | None = "ACCEPTED",
         vehicle: Callable[[], Vehicle | None] = lambda: None,
     ) -> None:
-        self.answer, self.sent = answer, []
+        self.answer, self.report_vehicle, self.sent = answer, vehicle, []
         self.listener = Listener()
         self.health = Health.BOOT
-        self._clock, self._vehicle = clock, vehicle
+        self._clock = clock
         self._waiting = Fixes()
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
         self._is_under_way, self._wish = False, None
 
     def take_turn(self, name: str) -> AbstractContextManager[None]:
-        if self._vehicle() is None:
+        if self.is_alive() and self.report_vehicle() is None:
             self.listener.handle_no_position(self._clock())
         return nullcontext()
 
@@ -197,7 +197,7 @@ class FakeLink:
         pass
 
     def vehicle(self) -> Vehicle | None:
-        return self._vehicle()
+        return self.report_vehicle() if self.is_alive() else None
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
         vehicle = self.vehicle()

@@ -5,8 +5,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from fakes import FakeClock, FakeLink
-from flights import PLACES, STEP_DEG, draw_pictures, prepare_flight
+from fakes import FakeClock
+from flights import PLACES, STEP_DEG, connect_autopilot, draw_pictures, prepare_flight
 from pictures import write_flight
 
 from edgevpr.cli.main import main
@@ -45,7 +45,7 @@ def clock():
 
 @pytest.fixture
 def link(clock):
-    return FakeLink(clock)
+    return connect_autopilot(clock)
 
 
 @pytest.fixture

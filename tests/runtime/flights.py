@@ -4,7 +4,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
-from fakes import FakeClock, FakeLink, FakeSource
+from fakes import FakeClock, FakeLink, FakeSource, make_vehicle
 from pictures import draw_texture
 
 from edgevpr.core.arrays import Image
@@ -25,6 +25,17 @@ from edgevpr.runtime.recognise.opening import open_recogniser
 
 PLACES = 30
 STEP_DEG = 0.001  # of latitude: 111 m
+
+
+def connect_autopilot(clock: FakeClock, off_deg=0.0042, has_gps=False) -> FakeLink:
+    """A link to the autopilot of an aircraft that passes a place a second, the first at 1000 s. The position that it
+    reports is `off_deg` of longitude off: 300 m unless given, so that a single match agrees with it and improves it."""
+
+    def report_vehicle():
+        known = {"has_gps": has_gps, "position_sd_m": 100.0, "velocity_m_s": (0.0, STEP_DEG * 111_195)}
+        return make_vehicle(50 + STEP_DEG * (clock() - 1000.0), 8.0 + off_deg, clock(), **known)
+
+    return FakeLink(clock, vehicle=report_vehicle)
 
 
 class Flight:
@@ -107,7 +118,7 @@ def noop() -> None:
 def fly_acts(place_map: Path, log: Path, acts) -> tuple[list[dict], list[dict], Flight]:
     """Fly over the first places of a map, an act before each frame. Returns the queries, all lines, and the flight."""
     clock, calls = FakeClock(), iter(acts)
-    flight = Flight(place_map, log, clock, FakeLink(clock), **{"source.rate_hz": 1.0})
+    flight = Flight(place_map, log, clock, connect_autopilot(clock), **{"source.rate_hz": 1.0})
     seen = [draw_texture(number % PLACES, 240, 320) for number in range(len(acts))]
     lines = flight.fly(FakeSource(seen, clock, work=lambda: next(calls)()))
     return select(lines, "query"), lines, flight

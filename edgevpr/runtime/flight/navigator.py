@@ -213,7 +213,7 @@ class Navigator(Listener):
         accuracy_m = math.hypot(match.accuracy_m, time_error_m)
         fix = Fix(match.position.lat_deg, match.position.lon_deg, accuracy_m, match.t_s)
         if vehicle is None or not vehicle.is_fresh(now_s):
-            return self._advise_without_report(fix, now_s)
+            return self._advise_without_report(fix, match, now_s)
         if vehicle.velocity_m_s is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
         predicted = self._navigation.predict_fix(match)
@@ -321,12 +321,13 @@ class Navigator(Listener):
             return PX4_INERTIAL_ERROR
         return GPS_ERROR if has_gps and not is_continuous else DEAD_RECKONING_ERROR
 
-    def _advise_without_report(self, fix: Fix, now_s: float) -> Advice:
+    def _advise_without_report(self, fix: Fix, match: PositionedMatch, now_s: float) -> Advice:
         """Advise on a fix without a recent report of a position: only an autopilot that reports that it has none gets
-        it, because nothing else can show that the match is wrong."""
+        it, once other matches confirm it, because nothing else can show that the match is wrong."""
         since_s = max(self._autopilot_since_s, self._vehicle.t_received_s if self._vehicle else -math.inf)
         has_none = now_s - self._no_position_s <= _REPORT_TIMEOUT_S < now_s - since_s
-        return Advice(fix) if has_none and not self._channel.is_continuous else _withhold(ReasonCode.NO_TELEMETRY)
+        is_wanted = has_none and not self._channel.is_continuous
+        return self._confirm(fix, match) if is_wanted else _withhold(ReasonCode.NO_TELEMETRY)
 
     def _confirm(self, fix: Fix, match: PositionedMatch) -> Advice:
         """Advise on the fix of a match that nothing predicts: hold it back until others, within reach, agree."""

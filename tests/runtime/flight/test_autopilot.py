@@ -8,6 +8,8 @@ from flights import draw_pictures, prepare_flight, select
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW
 
+HELD = False, {"code": "HELD_UNCONFIRMED", "parameters": {}}
+
 
 def list_fixes(lines):
     """Of each query, whether its fix was sent, and why not."""
@@ -15,10 +17,11 @@ def list_fixes(lines):
 
 
 def test_query_line_has_its_fix_and_the_last_answer(make_flight, clock, link):
-    lines = make_flight().fly(FakeSource(draw_pictures(3), clock))
-    assert list_fixes(lines) == [(True, None)] * 3
-    first = select(lines, "query")[0]["fix"]
-    assert (first["query"], first["lat_deg"], first["lon_deg"]) == ("frame 000000", 50.0, 8.0)
+    link.report_vehicle = lambda: None  # it has no position
+    lines = make_flight().fly(FakeSource(draw_pictures(4), clock))
+    assert list_fixes(lines) == [HELD, *[(True, None)] * 3]
+    fix = select(lines, "query")[1]["fix"]
+    assert (fix["query"], fix["lat_deg"], fix["lon_deg"]) == ("frame 000001", 50.001, 8.0)
     assert [line["result"] for line in select(lines, "answer")] == ["ACCEPTED"] * 3
     assert link.stats().fixes_sent == 3
 
@@ -43,9 +46,11 @@ def test_fix_of_a_slow_match_is_reported_as_too_old(make_flight, clock, link, st
     flown = make_flight()
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
-    lines = flown.fly(FakeSource(draw_pictures(3), clock))
+    link.report_vehicle = lambda: None  # it has no position
+    lines = flown.fly(FakeSource(draw_pictures(4), clock))
     assert all(line["accepted"] for line in select(lines, "query")), "accepted never means sent"
-    assert list_fixes(lines) == [(False, {"code": "FRAME_TOO_OLD", "parameters": {"age_s": 6.2, "limit_s": 5.0}})] * 3
+    too_old = False, {"code": "FRAME_TOO_OLD", "parameters": {"age_s": 6.2, "limit_s": 5.0}}
+    assert list_fixes(lines) == [HELD, *[too_old] * 3]
     assert link.stats().fixes_sent == 0
     assert "2 too late" in statuses[-1]
 
@@ -107,8 +112,8 @@ def test_failing_observer_does_not_end_the_flight(make_flight, clock, link, capl
 
 
 def test_blank_images_are_reported_once_after_ten_and_so_is_the_ground_again(make_flight, clock, link):
-    health, ground = [], draw_pictures(1, first=1)
-    seen = [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3]
+    health, seen = [], draw_pictures(19)
+    seen[1:16] = [np.zeros((240, 320), np.uint8)] * 15
     lines = make_flight().fly(FakeSource(seen, clock, work=lambda: health.append(link.health)))
     queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * 15, *[True] * 3]

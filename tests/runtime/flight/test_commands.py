@@ -17,6 +17,7 @@ def test_pause_stops_queries_and_sending_and_resumes_with_the_newest_image(make_
     answers, health = [], []
 
     def work():
+        link.predict_vehicle(clock())  # the autopilot reports during the pause too
         health.append(link.health.name)
         if wish := {2: UserCommand.PAUSE, 5: UserCommand.RESUME}.get(len(health)):
             answers.append(link.send_command(wish))

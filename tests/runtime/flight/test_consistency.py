@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, make_vehicle
-from flights import STEP_DEG, Flight, select
+from fakes import FakeClock, FakeSource
+from flights import Flight, connect_autopilot, select
 from pictures import draw_texture
 
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -20,13 +20,7 @@ START_S = 1000.0
 def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
     """A flight past the places, one a second, with an autopilot that is `off_deg` of longitude off; its lines, link."""
     clock = FakeClock()
-
-    def report_vehicle():
-        north = 50 + STEP_DEG * (clock.now_s - 1000.0)
-        said = {"has_gps": has_gps, "position_sd_m": 20.0, "velocity_m_s": (0.0, STEP_DEG * 111_195)}
-        return make_vehicle(north, 8.0 + off_deg, clock.now_s, **said)
-
-    link = FakeLink(clock, vehicle=report_vehicle)
+    link = connect_autopilot(clock, off_deg=off_deg, has_gps=has_gps)
     flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
     lines = flight.fly(FakeSource([draw_texture(number, 240, 320) for number in pictures], clock))
     return select(lines, "query"), link

@@ -10,9 +10,8 @@ from functools import partial
 
 import pytest
 from fakes import FakeSource, format_note
-from flights import PLACES, STEP_DEG, Flight, fly_acts, noop, select
+from flights import PLACES, STEP_DEG, Flight, draw_pictures, fly_acts, noop, select
 from map_writer import write_sql
-from pictures import draw_texture
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.messages import Health
@@ -84,7 +83,7 @@ def test_failures_are_critical_and_reported_once_after_ten_until_recovery(place_
     looks = [record_health] * MAX_FAILURES_IN_A_ROW
     calls = iter([noop, damage, *looks, partial(place_map.write_bytes, whole), *looks[:3]])
     count = MAX_FAILURES_IN_A_ROW + 6
-    lines = flight.fly(FakeSource([draw_texture(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
+    lines = flight.fly(FakeSource(draw_pictures(count), clock, work=lambda: next(calls)()))
     queries = select(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * (MAX_FAILURES_IN_A_ROW + 1), *[True] * 4]
     assert health[-4] is Health.CRITICAL

@@ -15,6 +15,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import DEAD_RECKONING_ERROR, GPS_ERROR, PX4_INERTIAL_ERROR
 from edgevpr.runtime.flight.consistency import PredictedFix
@@ -308,29 +309,31 @@ def test_match_is_sent_only_if_allowed(channel, reports, event, contradicts_m, c
     assert len(navigator._navigation.begun) == (contradicts_m is None)
 
 
+@pytest.mark.parametrize("has_position", [True, False])
 @pytest.mark.parametrize(
-    ("later_s", "off_m", "is_sent"), [(1.0, 20.0, True), (1.0, 60.0, False), (10.0, 60.0, True), (31.0, 0.0, False)]
+    ("matches", "sent"),
+    [
+        ([(0, 0, 1), (1, 20, 1)], "-+"),
+        ([(0, 0, 1), (1, 60, 2), (2, 80, 3)], "--+"),
+        ([(0, 0, 1), (10, 60, 1)], "-+"),
+        ([(0, 0, 1), (31, 0, 1)], "--"),
+        ([(0, 0, 1), (1, 0, 2)], "-+"),
+        ([(second, 0, 1) for second in range(5)], "---++"),
+    ],
 )
-def test_match_that_nothing_predicts_is_sent_if_it_confirms_another(later_s, off_m, is_sent):
-    navigator = navigate()
+def test_match_that_nothing_predicts_is_sent_if_others_confirm_it(has_position, matches, sent):
+    """Matches of one place each, so many seconds later and metres away. The autopilot may have a position."""
+    navigator = navigate(is_heard=has_position)
     navigator._navigation.contradicts_m = None
-    assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.HELD_UNCONFIRMED
-    navigator.handle_vehicle(replace(navigator._vehicle, t_received_s=NOW_S + later_s))
-    event, there = fake_match(), Position(*offset_position(*HOME, off_m, 0.0))
-    frame, located = replace(event.frame, t_mono_s=NOW_S + later_s), replace(event.located, position=there)
-    fix = navigator.advise(replace(event, frame=frame, located=located), NOW_S + later_s).fix
-    assert (fix and (fix.accuracy_m, fix.t_frame_s)) == ((1.5, NOW_S + later_s) if is_sent else None)
-
-
-def test_matches_of_one_place_in_a_hover_confirm_each_other_after_four():
-    navigator, sent = navigate(), []
-    navigator._navigation.contradicts_m = None
-    for second in range(5):
-        event = fake_match()
-        frame = replace(event.frame, t_mono_s=NOW_S + second)
-        navigator.handle_vehicle(replace(navigator._vehicle, t_received_s=NOW_S + second))
-        sent.append(navigator.advise(replace(event, frame=frame), NOW_S + second).fix is not None)
-    assert sent == [False, False, False, True, True]
+    for (later_s, off_m, place), is_sent in zip(matches, sent, strict=True):
+        t_s, there = NOW_S + later_s, Position(*offset_position(*HOME, off_m, 0.0))
+        if has_position:
+            navigator.handle_vehicle(replace(navigator._vehicle, t_received_s=t_s))
+        else:
+            navigator.handle_no_position(t_s)
+        advice = navigator.advise(make_match(there, t_s, None, 1.5, (place,)), t_s)
+        expected = Fix(there.lat_deg, there.lon_deg, 1.5, t_s), None
+        assert (advice.fix, advice.why) == (expected if is_sent == "+" else (None, Reason(ReasonCode.HELD_UNCONFIRMED)))
 
 
 def test_match_that_agrees_with_a_rough_prediction_is_sent_if_another_confirms_it():
@@ -349,20 +352,21 @@ def test_accuracy_of_a_fix_contains_the_error_of_its_time():
     assert navigator.accuracy_m(NOW_S) == pytest.approx(math.hypot(1.0, 5.0))
     unheard = navigate(is_heard=False)
     unheard.handle_no_position(NOW_S)
-    unheard = unheard.advise(fake_match(frame=late), NOW_S)
-    assert unheard.fix.accuracy_m == pytest.approx(1.5 * math.sqrt(2)), "an unknown speed is 15 m/s"
+    hover = [fake_match(frame=replace(late, t_mono_s=NOW_S + second)) for second in range(-3, 1)]
+    fixes = [unheard.advise(event, NOW_S).fix for event in hover]
+    assert fixes[3].accuracy_m == pytest.approx(1.5 * math.sqrt(2)), "an unknown speed is 15 m/s"
 
 
 @pytest.mark.parametrize("is_heard", [True, False])
-def test_match_that_nothing_judges_is_sent_only_if_the_autopilot_reports_no_position(is_heard):
+def test_match_that_nothing_judges_is_held_only_if_the_autopilot_reports_no_position(is_heard):
     navigator = navigate(is_heard=is_heard, reports={"t_received_s": NOW_S - 5.0})
     if not is_heard:
         navigator.handle_autopilot(NOW_S - 5.0)
     assert navigator.advise(fake_match(), NOW_S + 0.1).why.code is ReasonCode.NO_TELEMETRY
     navigator.handle_no_position(NOW_S)
     assert navigator.advise(fake_match(), NOW_S).why.code is ReasonCode.NO_TELEMETRY, "in its first five seconds"
-    assert navigator.advise(fake_match(), NOW_S + 0.1).fix
-    assert navigator.advise(fake_match(), NOW_S + 5.1).fix is None, "its reports have stopped"
+    assert navigator.advise(fake_match(), NOW_S + 0.1).why.code is ReasonCode.HELD_UNCONFIRMED
+    assert navigator.advise(fake_match(), NOW_S + 5.1).why.code is ReasonCode.NO_TELEMETRY, "its reports have stopped"
 
 
 def test_match_older_than_the_path_is_not_sent():

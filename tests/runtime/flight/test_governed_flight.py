@@ -30,7 +30,7 @@ class ScriptedMeter(FlightMeter):
 def govern(place_map, log, readings, count, fewer_candidates=(), **settings):
     """(changes, all lines, announcements, the flight) of a flight of `count` turns of 4 s."""
     clock = FakeClock()
-    flight = Flight(place_map, log, clock, FakeLink(clock), **settings)
+    flight = Flight(place_map, log, clock, FakeLink(clock, answer=None), **settings)
     source = FakeSource([draw_texture(0, 240, 320)] * count, clock, work=lambda: clock.sleep(TURN_S))
     lines = flight.fly(source, make_flight_meter(flight, ScriptedMeter, readings=readings), fewer_candidates)
     return select(lines, "governor"), lines, flight.link.texts(), flight

@@ -93,6 +93,7 @@ def test_sight_reports_tilt_after_five_seconds_and_its_end(sight_flight, tmp_pat
 
 @pytest.mark.slow
 def test_sight_reports_a_flight_that_leaves_its_map_and_returns(make_flight, clock, link):
+    link.answer = None  # without an autopilot, no fix is held back
     lines = make_flight().fly(FakeSource([*draw_pictures(8), *draw_pictures(40, first=100), *draw_pictures(8)], clock))
     assert link.texts() == [(4, MAP_LEFT), (6, MAP_FOUND)]
     assert [line["note"]["code"] for line in select(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
