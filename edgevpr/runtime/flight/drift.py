@@ -36,6 +36,7 @@ _GPS_LOSS_TURN_FACTOR = 10.0
 _ROTATION_SD_RAD = 0.035
 _MAX_ROTATION_RAD = 0.4
 _MAX_STEPPED_ROTATION_RAD = 0.6  # after a step of the heading
+_MAX_TURNED_M = 2.0  # after a larger one, odometry whose end the step would move by more is not used
 _MAX_ROTATION_SIGMA = 3.0  # a larger change: the autopilot has corrected its heading
 
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
@@ -109,7 +110,7 @@ class DriftFilter:
         self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
         self._contradictions = 0  # steps of odometry in a row that contradicted the state, since the last fix or GPS
         self._is_rotated = False  # the image of the last fix, by more than odometry is corrected for
-        self._has_stepped = False  # the heading, without a turn, and no match has shown since that it is nearly right
+        self._heading_step = 0.0  # radians, without a turn; no match has shown since that the heading is nearly right
         # Mean square of the attitude errors in the last pictures, divided by their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
         self._attitude_error_sd = _TYPICAL_ATTITUDE_ERROR_SD  # mean of the standard deviations of these errors
@@ -186,7 +187,11 @@ class DriftFilter:
         Returns True if the step agrees with the state and is used."""
         self._frame = position, variance_m2 = self._make_position_jacobian(age_s, attitude_gain_s2), sd_m**2
         position[:, _HEADING] = self._drift.is_inertial * np.array([bend_m[1], -bend_m[0]])
-        if step is None or self._is_rotated or self._contradictions == _MAX_CONTRADICTIONS:
+        is_doubted = self._is_rotated or self._contradictions == _MAX_CONTRADICTIONS
+        turned_m = 0.0
+        if step and self._heading_step > _MAX_STEPPED_ROTATION_RAD:  # too large for the linear model
+            turned_m = 2 * math.sin(self._heading_step / 2) * float(np.hypot(*step.moved_m))
+        if step is None or is_doubted or turned_m > _MAX_TURNED_M:
             self._begin_frame()
             return False
         ratio = math.exp(step.log_height)
@@ -207,7 +212,7 @@ class DriftFilter:
         transition[_F, _HEADING] = transition[_F, _TURN]
         x, p = self._x.copy(), transition @ self._p @ transition.T
         x[_F] += moved_m - path_moved_m
-        p[_F, _F] += step.sd_m**2 * _EYE
+        p[_F, _F] += (step.sd_m**2 + turned_m**2) * _EYE
         if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
             self._contradictions += 1
             self._begin_frame()
@@ -220,9 +225,9 @@ class DriftFilter:
         """Correct the direction of odometry and the heading by a match whose picture is rotated by `rotation` (radians,
         clockwise) against the compass. After a large rotation, odometry is not used until a match shows a smaller one.
         The motion shows later whether the camera or the compass is rotated."""
-        limit = _MAX_STEPPED_ROTATION_RAD if self._has_stepped else _MAX_ROTATION_RAD
+        limit = _MAX_STEPPED_ROTATION_RAD if self._heading_step else _MAX_ROTATION_RAD
         self._is_rotated = abs(rotation) > limit
-        self._has_stepped &= abs(rotation) > _MAX_ROTATION_RAD
+        self._heading_step *= abs(rotation) > _MAX_ROTATION_RAD
         if self._is_rotated:
             return
         matrix = np.zeros((1, _SIZE))
@@ -237,7 +242,7 @@ class DriftFilter:
         direction of odometry have been wrong by as much."""
         part = _HEADING if self._drift.is_inertial else _TURN
         self._p[part, part] += step_rad**2
-        self._has_stepped = True
+        self._heading_step = min(math.pi, self._heading_step + step_rad)
 
     def restart_odometry_scale(self, error: float, tolerance: float) -> None:
         """Restart the scale error of odometry at `error`, if the estimate differs by more than `tolerance`."""

@@ -232,7 +232,8 @@ class Navigation:
         if path is None or point is None:
             return
         step, path_moved_m = None, np.zeros(2)
-        if frame.odometry and before and before.t_s == frame.odometry.from_s:
+        is_of_this_heading = frame.t_s > self._heading_step_s
+        if frame.odometry and before and before.t_s == frame.odometry.from_s and is_of_this_heading:
             step, path_moved_m = frame.odometry, point.position_m - before.position_m
             self._doubt_m = self._doubt_m + frame.scale_sd * np.array(step.moved_m)
         age_s = path.now.t_s - frame.t_s
