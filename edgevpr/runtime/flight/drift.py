@@ -36,6 +36,7 @@ _GPS_LOSS_TURN_FACTOR = 10.0
 _ROTATION_SD_RAD = 0.035
 _MAX_ROTATION_RAD = 0.4
 _MAX_STEPPED_ROTATION_RAD = 0.6  # after a step of the heading
+_HEADING_STEP_DECAY = 0.9  # with each GPS position, once a second: with GPS, an autopilot corrects its heading
 _MAX_TURNED_M = 2.0  # after a larger one, odometry whose end the step would move by more is not used
 _MAX_ROTATION_SIGMA = 3.0  # a larger change: the autopilot has corrected its heading
 
@@ -170,6 +171,7 @@ class DriftFilter:
         errors = offset_m if error_m_s is None else np.concatenate([offset_m, error_m_s])
         variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
         self._contradictions = 0
+        self._heading_step *= _HEADING_STEP_DECAY
         self._correct(matrix[: errors.size], errors, np.diag(variances[: errors.size]))
 
     def add_frame(

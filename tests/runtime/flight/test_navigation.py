@@ -212,6 +212,24 @@ def test_known_scale_and_direction_of_odometry_are_applied_in_full(log_height, t
     assert np.hypot(*errors.estimate_errors(0.0)[0]) < 0.5
 
 
+@pytest.mark.parametrize(
+    ("moved_m", "gps_s", "turn", "is_used"),
+    [(9.0, 0, None, False), (1.0, 0, None, True), (9.0, 3, None, False), (9.0, 20, None, True), (9.0, 0, 0.0, True)],
+)
+def test_odometry_after_a_large_step_of_the_heading_waits_for_gps_or_a_match(moved_m, gps_s, turn, is_used):
+    errors = DriftFilter(INERTIAL, 1.0)
+    errors.start(1.0, 0.1)
+    errors.doubt_heading(1.5)
+    for _ in range(gps_s):
+        errors.correct_by_gps(np.zeros(2), 1.0, None, 0.3)
+    if turn is not None:
+        errors.correct_by_rotation(turn)
+    errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, None, np.zeros(2))
+    errors.predict(1.0, np.zeros(2))
+    step, way_m = STRIDE(moved_m=(moved_m, 0.0)), np.array((moved_m, 0.0))
+    assert errors.add_frame(0.0, np.zeros(2), 0.0, 0.2, step, way_m) is is_used
+
+
 def test_navigation_by_accelerations_alone_starts_at_a_fix():
     flown = NavigatedFlight(0, INERTIAL, fix_sd_m=2.0)
     navigation, match = flown.navigation, make_fix(Position(*HOME), -1.0, 3.0)
