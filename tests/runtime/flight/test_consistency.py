@@ -1,6 +1,7 @@
 """A fix that contradicts the autopilot's own position is held back until a second, independent one says the same."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from fakes import FakeClock, FakeSource
 from flights import Flight, connect_autopilot, select
 from pictures import draw_texture
 
+from edgevpr.core.geodesy import move_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.consistency import Consistency, PredictedFix
+from edgevpr.runtime.flight.consistency import Consistency, PredictedFix, can_follow, confirm_each_other
 from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 
 HOME = 50.0, 8.0
@@ -154,3 +156,43 @@ def test_consistency_reports_the_rotation_of_an_image(before_deg, error_deg):
     for has_gps in (True, False):
         reason = judge.judge(make_fix(0.0, 1, error_deg=error_deg), has_gps=has_gps, is_tracked=False).reason
         assert reason == Reason(ReasonCode.HELD_ROTATED, {"rotation_deg": error_deg})
+
+
+def make_match(off_m, t_s=0.0, place=1):
+    """An accepted match off to the east, whose standard deviation is 2.35 m."""
+    return replace(make_fix(0.0, t_s, place).match, position=move_position(Position(*HOME), off_m, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("offs_m", "places", "is_confirmed"),
+    [
+        ([], "", False),
+        ([0], "1", False),
+        ([0, 0], "12", True),
+        ([0, 0, 0], "111", False),
+        ([0, 0, 0, 0], "1111", True),
+        ([0, 90, 0], "121", False),
+        # Apart by more than four standard deviations of the difference: 13.27 m.
+        ([0, 13.2], "11", False),
+        ([0, 0, 13.4], "111", True),
+    ],
+)
+def test_matches_confirm_each_other_if_independent_or_four(offs_m, places, is_confirmed):
+    matches = [make_match(off_m, place=place) for off_m, place in zip(offs_m, places, strict=True)]
+    assert confirm_each_other(matches) is is_confirmed
+
+
+@pytest.mark.parametrize(
+    ("off_m", "after_s", "can"),
+    [
+        (64.2, 2, True),
+        (64.3, 2, False),
+        (9, 0.5, True),
+        (0, 0, False),
+        (0, -0.5, False),
+        (0, 120, True),
+        (0, 120.1, False),
+    ],
+)
+def test_matches_can_follow_each_other_at_thirty_metres_a_second(off_m, after_s, can):
+    assert can_follow(make_match(0.0, 50.0), make_match(off_m, 50.0 + after_s)) is can, "each is good to 1 m"
