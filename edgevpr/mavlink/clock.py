@@ -65,7 +65,8 @@ class AutopilotClock:
     answer with the shortest round trip within the last ten seconds. If TIMESYNC is not answered within five seconds,
     timestamps are taken from our own clock until the autopilot restarts."""
 
-    def __init__(self) -> None:
+    def __init__(self, announce: Announce) -> None:
+        self._announce = announce
         self._requests_ns: deque[int] = deque(maxlen=_MAX_REQUESTS)
         self._first_request_s = self._due_s = -math.inf  # times of the first request and of the next one
         self._answers: list[_Answer] = []
@@ -85,6 +86,7 @@ class AutopilotClock:
         if self._best is None and not self._uses_own_clock and now_s - self._first_request_s > TIMESYNC_TIMEOUT_S:
             self._uses_own_clock = True
             log.warning("the autopilot does not answer TIMESYNC: using our own clock for timestamps")
+            self._announce(Severity.WARNING, "no answer to TIMESYNC: our clock used", "clock")
         if now_s < self._due_s:
             return None
         is_urgent = self._gap_end_s is not None or (self._best is None and not self._uses_own_clock)

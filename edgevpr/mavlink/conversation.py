@@ -203,9 +203,11 @@ class Conversation:
         if own_report_s is None or own_report_s != self._own_report_s:  # another channel, a new report, or a restart
             self._own_report_s = -math.inf if own_report_s is None else own_report_s
             self._reported_inputs = self.sent["GPS_INPUT"]
-        if self.sent["GPS_INPUT"] - self._reported_inputs >= MAX_UNREPORTED_INPUTS and not self._is_ignored:
+        is_overdue = self.sent["GPS_INPUT"] - self._reported_inputs >= MAX_UNREPORTED_INPUTS
+        if is_overdue and self._own_report_s == -math.inf and not self._is_ignored:  # otherwise its reports are lost
             self._is_ignored = True
-            self.announce(Severity.WARNING, "autopilot ignores GPS_INPUT: reboot it", "GPS_INPUT")
+            advice = "" if self.autopilot.is_armed else ": reboot it"
+            self.announce(Severity.WARNING, f"autopilot ignores GPS_INPUT{advice}", "GPS_INPUT")
         elif self._is_ignored and self._own_report_s > -math.inf:
             self._is_ignored = False
             self.announce(Severity.INFO, "autopilot uses GPS_INPUT", "GPS_INPUT")
@@ -291,7 +293,9 @@ class Conversation:
 
     def _make_origin(self, origin: Position, system_id: int) -> Message:
         """Make the message that sets the origin; if the map lacks its altitude, request the air pressure first."""
-        alt_m = self.autopilot.pressure_alt_m if origin.alt_m is None else origin.alt_m
+        alt_m, pressure_alt_m = origin.alt_m, self.autopilot.pressure_alt_m
+        if alt_m is None and pressure_alt_m is not None:
+            alt_m = pressure_alt_m - self.autopilot.heights.compute_height_m(self._clock())
         if alt_m is None:
             if self._has_requested_pressure:
                 self.announce(Severity.WARNING, "origin altitude unknown: set EKF origin", "origin")

@@ -169,7 +169,7 @@ class Autopilot:
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self._vehicles: tuple[Vehicle, ...] = ()  # of the last six seconds
         self.attitudes, self.heights, self.accuracy = Attitudes(), Heights(self._announce), PositionAccuracy()
-        self.clock, self.imu_s = AutopilotClock(), -math.inf  # when accelerations were last received
+        self.clock, self.imu_s = AutopilotClock(self._announce), -math.inf  # when accelerations were last received
         self.px4 = Px4Fusion()
         self.receivers, self.foreign_stamps = Receivers(), ForeignStamps()
         self.report_delay = ReportDelay(self._announce)

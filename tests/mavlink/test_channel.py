@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scripted_autopilot import STATE, Autopilot, RecordingListener
+from scripted_autopilot import ARMED, STATE, Autopilot, RecordingListener
 from simulated.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
 from simulated.firmware import PX4 as PX4_PARAMETERS
 
@@ -79,6 +79,17 @@ def test_odometry_waits_for_an_origin_and_sets_one_if_allowed():
     autopilot.beat()
     assert len(collect(autopilot, "ODOMETRY")) == pytest.approx(10, abs=1)
     assert autopilot.conversation.sent["SET_GPS_GLOBAL_ORIGIN"] == 2
+
+
+def test_origin_from_the_pressure_in_flight_has_the_altitude_of_the_ground():
+    autopilot, _ = interview(VISO_TYPE=1, seconds=6, origin=Position(46.5, 7.5))
+    autopilot.locate((0.0, 0.0), 0.0, 100.0)
+    autopilot.send(mavlink.MAVLink_scaled_pressure_message(0, 945.0, 0, 2000))
+    origins = []
+    for _ in range(12):
+        autopilot.beat()
+        origins += [message.altitude / 1e3 for message in collect(autopilot, "SET_GPS_GLOBAL_ORIGIN")]
+    assert {round(alt_m) for alt_m in origins} == {484}
 
 
 def test_origin_without_altitude_uses_the_pressure_altitude():
@@ -209,17 +220,19 @@ def test_conversation_sends_a_fix_between_matches_after_half_a_second():
     assert collect(autopilot, "COMMAND_INT", 4.0) == [], "its velocity follows a fix"
 
 
-def test_ardupilot_that_does_not_report_our_receiver_is_to_be_rebooted():
-    """A new GPS2_TYPE is used after a reboot only; a receiver that is used is reported (real ArduPilot 4.7-dev)."""
+@pytest.mark.parametrize(("base_mode", "advice"), [(0, ": reboot it"), (ARMED, "")])
+def test_ardupilot_that_does_not_report_our_receiver_is_to_be_rebooted(base_mode, advice):
+    """A new GPS2_TYPE is used after a reboot only; a receiver that is used is reported (real ArduPilot 4.7-dev). Later
+    its reports may be lost."""
     autopilot, _ = interview(GPS2_TYPE=14)
     texts = []
-    for second in range(30):
-        autopilot.beat()
-        if second >= 20:
+    for second in range(50):
+        autopilot.beat(base_mode)
+        if 20 <= second < 30:
             autopilot.gps(message=mavlink.MAVLink_gps2_raw_message)
         texts += [said.text.removeprefix("edgevpr: ") for said in collect(autopilot, "STATUSTEXT")]
     assert [text for text in texts if "GPS_INPUT" in text] == [
-        "autopilot ignores GPS_INPUT: reboot it",
+        f"autopilot ignores GPS_INPUT{advice}",
         "autopilot uses GPS_INPUT",
     ]
 

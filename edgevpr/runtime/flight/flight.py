@@ -36,6 +36,7 @@ from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import MapCoverageWatch, MapWatch, SurveyReporter, Tally
 from edgevpr.runtime.preflight.pick import list_safe_candidates
+from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
 _MAX_WAIT_S = 0.2  # longest wait of one pass of the loop for a frame
@@ -102,10 +103,14 @@ class Flight:
                 stack.enter_context(flight_log)
             flight_log.write("start", **log_start(config, io, recogniser))
             step_s, settings, camera = 1 / io.board.rate_hz, config.mavlink, config.source
-            navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, camera.gimbal)
+            looks_down = recogniser.technique.spec.looks_down
+            shows_tilt = not looks_down or camera.gimbal or read_camera_lens(camera) is not None
+            navigator = Navigator(
+                settings.min_accuracy_m, step_s, not settings.send_fixes, is_level=camera.gimbal, shows_tilt=shows_tilt
+            )
             origin = find_origin(recogniser.place_map, camera) if settings.set_origin else None
             link = open_link(settings, io, navigator, origin, stack)
-            source = io.open_source(step_s, not recogniser.technique.spec.looks_down)
+            source = io.open_source(step_s, not looks_down)
             stack.callback(source.close)
             if link and not source.is_live and settings.send_fixes:
                 _log.warning("%s is a recording: its fixes are not positions of this vehicle", camera.uri)

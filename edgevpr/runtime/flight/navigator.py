@@ -88,11 +88,20 @@ def _withhold(code: ReasonCode) -> Advice:
 class Navigator(Listener):
     """Navigates for one autopilot: estimates the aircraft's position, and decides what to send. `map_sd_m` is the
     standard deviation of the error common to all fixes, `interval_s` the time between queries. With `is_muted`,
-    in a dry run, it only gives advice. `is_level`: the camera is on a gimbal and stays level at any attitude. `age`
-    estimates the hidden delay of the pictures from the reported motion."""
+    in a dry run, it only gives advice. `is_level`: the camera is on a gimbal and stays level at any attitude.
+    `shows_tilt`: False if errors of the attitude move positions, but pictures of an unknown lens do not show them.
+    `age` estimates the hidden delay of the pictures from the reported motion."""
 
-    def __init__(self, map_sd_m: float, interval_s: float, is_muted: bool = False, is_level: bool = False) -> None:
-        self._is_muted, self._is_level = is_muted, is_level
+    def __init__(
+        self,
+        map_sd_m: float,
+        interval_s: float,
+        is_muted: bool = False,
+        *,
+        is_level: bool = False,
+        shows_tilt: bool = True,
+    ) -> None:
+        self._is_muted, self._is_level, self._shows_tilt = is_muted, is_level, shows_tilt
         self._map_sd_m, self._fix_interval_s = map_sd_m, min(interval_s, INTERIM_FIX_INTERVAL_S)
         self._navigation = Navigation(DEAD_RECKONING, map_sd_m)
         self._consistency, self.age = Consistency(), AgeWatch()
@@ -294,6 +303,9 @@ class Navigator(Listener):
         """Decide what to send now."""
         if vehicle is None:
             return Output.STARTING
+        # PX4's attitude follows our positions: if pictures do not show its errors, these grow (a copter was 80 m away).
+        if self._channel in _PX4_CHANNELS and not self._shows_tilt:
+            return Output.NO_LENS
         if vehicle.reaches_another:
             return Output.LINK_SHARED
         uses_gps = _may_use_gps(vehicle)

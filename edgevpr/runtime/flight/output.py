@@ -33,6 +33,7 @@ class Output(Enum):
     CONTRADICTS_GPS = Severity.WARNING, "position contradicts GPS: nothing sent"
     LEADS_AWAY = Severity.WARNING, "autopilot drifts off GPS: nothing sent"
     REFUSED = Severity.WARNING, "autopilot refuses positions: not sent"
+    NO_LENS = Severity.WARNING, "field of view unknown: nothing is sent"
     LINK_SHARED = Severity.WARNING, "two autopilots on link: nothing sent"
     PAUSED = Severity.INFO, "paused: no positions are sent"
 

@@ -140,6 +140,12 @@ def test_output_is_chosen_by_channel_and_receiver(channel, reports, before, outp
     assert navigator.output is output
 
 
+@pytest.mark.parametrize("channel", [Channel.SENSOR, Channel.VISION, Channel.GPS_INPUT, Channel.ODOMETRY])
+def test_px4_gets_no_position_if_images_cannot_show_its_tilt(channel):
+    state = navigate(channel, how={"shows_tilt": False}).estimate_state(NOW_S)
+    assert (state is None) is (channel in (Channel.SENSOR, Channel.VISION))
+
+
 def test_navigator_sends_no_unknown_contradicted_or_withdrawn_position():
     unheard, unknown = navigate(Channel.GPS_INPUT, is_heard=False), navigate(Channel.GPS_INPUT, accuracy_m=None)
     for navigator in (unheard, unknown):
