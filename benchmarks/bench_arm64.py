@@ -43,11 +43,7 @@ CPU part\t: 0xd03
 CPU revision\t: 4
 """
 _GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28")  # versions that wheels are built for
-_COLUMNS = {
-    "part": "{part}",
-    "million instructions": "{millions:.2f}",
-    "s on Zero 2 W": "{zero_s:.3f}",
-}
+_COLUMNS = {"part": "{part}", "million instructions": "{millions:.2f}", "s on Zero 2 W": "{zero_s:.3f}"}
 
 
 def main() -> None:

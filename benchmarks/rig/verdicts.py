@@ -146,6 +146,8 @@ def format_page(result: Row) -> str:
     """Return the results as Markdown."""
     cells = result["cells"]
     wrong = [row for row in cells if not row["is_right"]]
+    flown = [row for row in cells if is_refused(row["with"]) and not row["with"]["cannot"]]
+    led = [row["cell"] for row in flown if any(row["with"][k] > row["control"][k] + MARGIN_M for k in _DISTANCES)]
     texts = "\n".join(f"* {row['cell']}: {'; '.join(row['with']['texts']) or 'none'}" for row in cells)
     with_edgevpr = [f"{row['cell']} (by {row['beside']})" for row in cells if CELLS[row["cell"]].control.has_edgevpr]
     commits = Counter(row["with"]["commit"] for row in cells)
@@ -166,7 +168,8 @@ moves a PX4 that lands without a position by tens of metres.
 
 Right: compared with the controls, no distance is more than {MARGIN_M:.0f} m worse, and GPS is used again at most
 {MARGIN_S:.0f} s later; positions come within {FIRST_POSITION_S:.0f} s of a start of the autopilot, none while paused.
-Refused: edgevpr has warned, and it sends nothing or the aircraft does not arm.
+Refused: edgevpr has warned, and it sends nothing or the aircraft does not arm. Of these, farther than alone, by chance
+or because the aircraft flew by edgevpr alone, which then sent nothing: {", ".join(led) or "none"}.
 
 {base.format_table(cells, _COLUMNS)}
 

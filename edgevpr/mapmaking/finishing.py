@@ -72,8 +72,9 @@ def refine_map(
     refined = refine(place_map, technique, progress, images)
     if refined.is_mirrored:
         _log.warning(
-            "lat and lon may be swapped, or one has the wrong sign (south and west are negative): the pictures fit the "
-            "mirror image of their positions, so %s was not refined; check the columns, then rebuild the map",
+            "lat and lon may be swapped, one may have the wrong sign (south and west are negative), or the camera is "
+            "tilted: the pictures fit the mirror image of their positions, so %s was not refined; check columns and "
+            "camera, then rebuild the map",
             place_map.path,
         )
     if abs(refined.turned_deg) > MAX_TURN_DEG:

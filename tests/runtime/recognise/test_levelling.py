@@ -118,7 +118,7 @@ def test_step_finds_a_level_image_whatever_attitude_is_reported(walk, ground, wr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pitch_deg", [30.0, 45.0, 52.0])
+@pytest.mark.parametrize("pitch_deg", [30.0, 45.0, 52.0, 60.0])
 def test_step_locates_the_aircraft_from_a_steep_image_of_known_angles(walk, ground, pitch_deg):
     steep = frame(ground, 2, pitch_deg=pitch_deg)
     event = walk(make_scaling()).step(steep)
@@ -299,7 +299,7 @@ def test_step_needs_no_attitude_for_a_level_image(walk, ground):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.7, 1.3])
+@pytest.mark.parametrize("factor", [0.7, 1.3, 1.4])
 def test_step_corrects_a_wrong_recorded_height_after_the_first_match(walk, ground, factor):
     prior = RecordedPrior(("height",))
     recogniser = walk(make_scaling(), prior)
