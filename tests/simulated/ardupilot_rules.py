@@ -9,15 +9,7 @@ import math
 
 from edgevpr.core.arrays import LatLon
 from edgevpr.mavlink.wire import Message, mavlink
-from simulated.firmware import (
-    ARDUPILOT,
-    ARDUPILOT_PLANE,
-    DENIED,
-    FAILED,
-    OK,
-    POSITION_NOISE_M,
-    Firmware,
-)
+from simulated.firmware import ARDUPILOT, ARDUPILOT_PLANE, DENIED, FAILED, OK, POSITION_NOISE_M, Firmware
 from simulated.motion import Motion, displace
 from simulated.sensors import FIX_3D, PositionMeasurement
 

@@ -110,13 +110,7 @@ class Px4(Firmware):
         return is_used
 
     def _fuse_or_reset(
-        self,
-        aid: _Aid,
-        point: LatLon,
-        sd_m: float,
-        *,
-        may_reset: bool,
-        gate_sd: float = GATE_SD,
+        self, aid: _Aid, point: LatLon, sd_m: float, *, may_reset: bool, gate_sd: float = GATE_SD
     ) -> bool:
         """Fuse a position within the gate. One that stays outside of it resets the estimate after 7 s or, unless it
         `may_reset`, is no longer fused. Returns True if it was used."""

@@ -23,6 +23,7 @@ _DRIFT_M_S = 2.5  # path drift allowed between two fixes that agree
 _TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
 _FIXES_TO_OVERRULE_TRACK = 4
 _MAX_SUPPORT = 20  # fixes that support a path; GPS counts as many
+_SUPPORT_TIMEOUT_S = 10.0  # a path without a fix for longer before fixes contradict it has drifted, and is not kept
 _MAX_ROUTE_INTERVAL_S = 10.0
 _MAX_SPEED_M_S = 30.0
 _MAX_UNPREDICTED_INTERVAL_S = 120.0  # between two matches that nothing predicts
@@ -67,10 +68,12 @@ class Consistency:
     disagree too: then four fixes at different places are accepted, if an aircraft could have flown from each to the
     next. Four are also needed where visual odometry tracks the path: repetitive ground can repeat a wrong fix. Even
     four may be wrong: until as many fixes support the new path as supported the overruled one (at most 20, also for
-    GPS), it is in doubt, and a single fix where the other one leads returns to that."""
+    GPS), it is in doubt, and a single fix where the other one leads returns to that. A path that nothing had supported
+    for ten seconds is overruled without a doubt: off the map, odometry drifts."""
 
     def __init__(self) -> None:
         self._support = 0  # fixes since the path began or overruled another one
+        self._supported_s = -math.inf  # time of the last of them, or of GPS
         self._overruling: PredictedFix | None = None  # the last fix that overruled a tracked path, which may be right
         self._overruled_support = 0
         self._agreeing: list[PredictedFix] = []  # held fixes: one, and later ones that agree with it
@@ -88,9 +91,9 @@ class Consistency:
         """Distance to the position on the path that was overruled, while that may be right; otherwise 0."""
         return float(np.hypot(*self._overruling.innovation_m)) if self._overruling else 0.0
 
-    def trust_path(self) -> None:
-        """Process a position of GPS that supports the path."""
-        self._support, self._overruling = _MAX_SUPPORT, None
+    def trust_path(self, t_s: float) -> None:
+        """Process a position of GPS at `t_s` that supports the path."""
+        self._support, self._supported_s, self._overruling = _MAX_SUPPORT, t_s, None
 
     def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
         """Gate a fix by its innovation. `has_gps`: of the autopilot, and trusted; `is_tracked`: by visual odometry."""
@@ -117,7 +120,8 @@ class Consistency:
         if all(match.shares_no_place_with(held.match) for held in self._flyable):  # neighbours share places
             self._flyable.append(fix)
         drift_m_s = _TRACKED_DRIFT_M_S if is_tracked else _DRIFT_M_S
-        first = self._agreeing[0] if self._agreeing and heading_agrees else None
+        is_recent = bool(self._agreeing) and match.t_s - self._agreeing[-1].match.t_s <= _HELD_FIX_TIMEOUT_S
+        first = self._agreeing[0] if is_recent and heading_agrees else None
         if first and _compute_distance(first, fix, drift_m_s) <= _MAX_DISAGREEMENT_SIGMA:
             self._agreeing.append(fix)
             is_enough = not is_tracked or len(self._agreeing) >= _FIXES_TO_OVERRULE_TRACK
@@ -132,12 +136,13 @@ class Consistency:
         return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"distance_m": error_m, "accuracy_m": predicted_sd_m}))
 
     def _overrule(self, fix: PredictedFix, is_tracked: bool, restarts_path: bool = False) -> GateResult:
-        self._overruling = fix if is_tracked else None
+        unsupported_s = (self._agreeing or self._flyable)[0].match.t_s - self._supported_s
+        self._overruling = fix if is_tracked and unsupported_s <= _SUPPORT_TIMEOUT_S else None
         self._support, self._overruled_support = 0, self._support
         return self._accept(fix, GateResult(overrules_path=True, restarts_path=restarts_path))
 
     def _accept(self, fix: PredictedFix, verdict: GateResult) -> GateResult:
-        self._agreeing, self._flyable = [], []
+        self._agreeing, self._flyable, self._supported_s = [], [], fix.match.t_s
         if fix.match.heading_error_deg is not None:
             self._heading_error_deg = fix.match.heading_error_deg
         return verdict
@@ -164,9 +169,7 @@ def can_follow(before: PositionedMatch, match: PositionedMatch) -> bool:
 
 
 def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:
-    """Return the difference of the innovations of two fixes in standard deviations; infinity if over 30 s apart."""
-    if abs(other.match.t_s - one.match.t_s) > _HELD_FIX_TIMEOUT_S:
-        return math.inf
+    """Return the difference of the innovations of two fixes in standard deviations."""
     return mahalanobis(other.innovation_m - one.innovation_m, _sum_covariances(one, other, drift_m_s))
 
 

@@ -174,7 +174,7 @@ class Navigator(Listener):
         self._vehicle = vehicle
         navigation.add_report(vehicle, self._trusts_gps)
         if navigation.has_gps:
-            self._consistency.trust_path()
+            self._consistency.trust_path(vehicle.t_received_s)
         self._watch.update(vehicle, navigation.last_fix_s, navigation.has_gps)
         if navigation.path_velocity_m_s is not None:
             velocity_m_s, error = navigation.path_velocity_m_s, self._choose_velocity_error()

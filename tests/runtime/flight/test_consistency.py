@@ -74,6 +74,8 @@ def abbreviate(result):
         # Where the camera has followed the path it takes four, after 24 s within 2 * 12.45 m.
         ([(100, 0, 0), (100, 8, 1), (100, 16, 2), (124.8, 24, 3)], True, "hhha"),
         ([(100, 0, 0), (100, 8, 1), (100, 16, 2), (125.0, 24, 3)], True, "hhhh"),
+        ([(100, 0, 0), (100, 30, 1), (100, 60, 2), (100, 90, 3)], True, "hhha"),
+        ([(100, 0, 0), (100, 30, 1), (100, 60, 2), (100, 90.1, 3)], True, "hhhh"),
         # The same place is another one if the aircraft has flown on by more than 24 m.
         ([(100, 0), (100, 2, 1, {"path_m": 24.0})], False, "hh"),
         ([(100, 0), (100, 2, 1, {"path_m": 24.1})], False, "ha"),
@@ -115,6 +117,20 @@ def test_consistency_doubts_a_new_track_until_as_many_fixes_support_it(supported
     assert judge.doubt_m == 0
 
 
+@pytest.mark.parametrize(("gap_s", "doubt_m"), [(10.0, 100), (10.1, 0)])
+@pytest.mark.parametrize("is_by_gps", [False, True])
+def test_consistency_does_not_doubt_a_new_track_if_nothing_supported_the_old_one(is_by_gps, gap_s, doubt_m):
+    judge = Consistency()
+    if is_by_gps:
+        judge.trust_path(START_S)
+    else:
+        judge.judge(make_fix(0, 0), has_gps=False, is_tracked=True)
+    fixes = [make_fix(100, gap_s + 3 * number, number) for number in range(4)]
+    verdicts = [judge.judge(fix, has_gps=False, is_tracked=True) for fix in fixes]
+    assert "".join(map(abbreviate, verdicts)) == "hhha"
+    assert judge.doubt_m == doubt_m
+
+
 def test_consistency_returns_to_a_track_in_doubt_at_the_first_fix_there():
     judge = Consistency()
     judge_track(judge, 0, 0, 9)
@@ -123,7 +139,7 @@ def test_consistency_returns_to_a_track_in_doubt_at_the_first_fix_there():
         assert judge_track(judge, 12, 100, 1) + judge_track(judge, 0, 12, 1) == "a."
         assert judge.doubt_m == 0
     assert judge_track(judge, -100, 0, 4) == "hhha"
-    judge.trust_path()
+    judge.trust_path(0.0)
     assert judge.doubt_m == 0, "GPS supports it"
     assert judge_track(judge, 0, -100, 1) == "h"
 

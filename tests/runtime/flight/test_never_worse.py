@@ -178,6 +178,18 @@ def test_cliff_beyond_the_map_is_followed_and_where_it_is_not_seen_claimed(vehic
         assert away_m < (30 if flight.show_ground else max(10.0, 3 * state.accuracy_m))
 
 
+@pytest.mark.parametrize("match_every", [2, 3, 10])
+def test_correct_matches_are_sent_soon_after_flight_over_lower_ground_off_the_map(match_every):
+    """Odometry is 90 m off by then. Positions must not end: after 15 s without one, ArduPilot's filter stops."""
+    flight = ClosedLoop("arducopter", velocity_m_s=10j, **GPS_INPUT).fly(30)
+    flight.set("SIM_GPS1_ENABLE", 0).fly(12)
+    flight.matches, flight.stride_scale = False, 1 / 1.3
+    flight.fly(30)
+    flight.matches, flight.stride_scale, flight.match_every = True, 1.0, match_every
+    flight.fly(20 + 4 * match_every)
+    assert flight.fly(10).worst_m(flight.now_s - 10)[1] < 15
+
+
 @pytest.mark.parametrize(("matched_s", "scale"), [(0, 1.4), (15, 1.4), (15, 0.7)])
 def test_odometry_over_other_ground_is_correct_once_matches_show_its_height(matched_s, scale):
     """Strides alone, 1.4 times short: uncorrected they lose 86 m in 20 s. Before the height is corrected, matches show
